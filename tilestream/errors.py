@@ -1,0 +1,65 @@
+"""Every error that tilestream raises on purpose: one small tree.
+
+A message says what is wrong, where, and what to do about it. Each class is also the built-in
+exception that a caller would expect, so `except FileNotFoundError` works as usual.
+"""
+
+
+class TilestreamError(Exception):
+    """Base of all errors raised on purpose."""
+
+
+class UsageError(TilestreamError, ValueError):
+    """An argument or a setting that cannot be used as given."""
+
+
+class SourceError(TilestreamError):
+    """An input file or log that cannot be read as what it claims to be."""
+
+
+class SourceNotFoundError(SourceError, FileNotFoundError):
+    """No file at a path, or a glob that matches nothing."""
+
+
+class UnknownFormatError(SourceError, ValueError):
+    """A file whose ending or content is of no supported format."""
+
+
+class CorruptSourceError(SourceError, ValueError):
+    """A file cut short, damaged, or with a header that contradicts its content."""
+
+
+class CrsError(SourceError, ValueError):
+    """Sources in different coordinate reference systems, or a CRS that pyproj cannot read."""
+
+
+class PoseError(SourceError, ValueError):
+    """A log without poses, or a time outside of the poses it has."""
+
+
+class StoreError(TilestreamError):
+    """A tile store that cannot be used as asked."""
+
+
+class StoreNotFoundError(StoreError, FileNotFoundError):
+    """No tile store at a path."""
+
+
+class StoreVersionError(StoreError):
+    """A store written by a newer version of tilestream."""
+
+
+class TileNotReadyError(StoreError, LookupError):
+    """A tile (or one of its tables) that is missing, failed or skipped; the message says why."""
+
+
+class RegistrationError(TilestreamError, ValueError):
+    """A scan that cannot be registered: nothing near it, too few points, start poses not rigid."""
+
+
+class TaskError(TilestreamError):
+    """A task of the dataflow that failed; the message carries its reason."""
+
+
+class PlanError(TilestreamError):
+    """A job that does not fit what it was promised (memory, disk); says what to change."""

@@ -1,0 +1,75 @@
+"""The sensor is data: what a lidar sees, as numbers that a user can write down for another one."""
+
+import itertools
+from typing import Annotated, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+
+class Sensor(BaseModel):
+    """A spinning lidar."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str
+    """What to call it in tables and reports."""
+    range_max: Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+    """Largest range of a return [m]."""
+    elevations_deg: Annotated[tuple[float, ...], Field(min_length=2)]
+    """Elevation of each beam above the horizontal [deg], rising."""
+    fov_deg: tuple[float, float]
+    """Lowest and highest elevation of the vertical field of view [deg]."""
+    azimuth_step_deg: Annotated[float, Field(gt=0.0, le=90.0)]
+    """Angle between two firings of a beam [deg]."""
+    rate_hz: Annotated[float, Field(gt=0.0)]
+    """Turns per second [1/s]."""
+    range_noise: Annotated[float, Field(ge=0.0)] = 0.02
+    """Standard deviation of a range [m]."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        low, high = self.fov_deg
+        if not -90.0 <= low < high <= 90.0:
+            raise ValueError(f"fov_deg {self.fov_deg}: give lowest < highest within [-90, 90]")
+        beams = self.elevations_deg
+        if any(b <= a for a, b in itertools.pairwise(beams)):
+            raise ValueError("elevations_deg must rise from the lowest beam to the highest")
+        if not (beams[0] >= -90.0 and beams[-1] <= 90.0):
+            raise ValueError("elevations_deg must lie within [-90, 90]")
+        return self
+
+
+def _even(low: float, high: float, beams: int) -> tuple[float, ...]:
+    return tuple(low + (high - low) * i / (beams - 1) for i in range(beams))
+
+
+VLP16 = Sensor(
+    name="VLP16",
+    range_max=100.0,
+    elevations_deg=_even(-15.0, 15.0, 16),
+    fov_deg=(-15.0, 15.0),
+    azimuth_step_deg=360.0 / 904,
+    rate_hz=20.0,
+)
+"""Velodyne VLP-16, the paper's sensor: 16 beams, +-15 deg, 100 m, 904 firings per turn at 20 Hz."""
+
+HDL64 = Sensor(
+    name="HDL64",
+    range_max=120.0,
+    elevations_deg=tuple(-24.33 + 15.5 / 31 * i for i in range(32))
+    + tuple(-8.33 + 10.33 / 31 * i for i in range(32)),
+    fov_deg=(-24.9, 2.0),
+    azimuth_step_deg=0.1728,
+    rate_hz=10.0,
+)
+"""Velodyne HDL-64E, KITTI's sensor: two blocks of 32 beams, 1/2 deg below -8.33 deg, 1/3 above."""
+
+OS1_128 = Sensor(
+    name="OS1_128",
+    range_max=120.0,
+    elevations_deg=_even(-22.5, 22.5, 128),
+    fov_deg=(-22.5, 22.5),
+    azimuth_step_deg=360.0 / 1024,
+    rate_hz=10.0,
+)
+"""Ouster OS1-128: 128 beams, +-22.5 deg, 120 m, 1024 firings per turn at 10 Hz."""
