@@ -1,0 +1,377 @@
+"""PCD, the point clouds of PCL and Autoware: ascii, binary and binary_compressed."""
+
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tilestream.errors import CorruptSourceError, UsageError
+from tilestream.formats.base import Block, SourceInfo, Span
+from tilestream.formats.rows import (
+    BinaryRows,
+    Column,
+    Columns,
+    TextRows,
+    as_points,
+    even_spans,
+    finite_block,
+    steps,
+    table_of,
+    whole_span,
+    writing_whole,
+)
+from tilestream.kernels import lzf
+
+_KEYWORDS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS")
+_HEADER_MAX = 1 << 16
+"""Longest header that is read [bytes]."""
+_SIZES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
+_TWO_SIZES = np.dtype("<u4")
+"""Compressed and uncompressed size stand before the data of binary_compressed [bytes]."""
+
+Encoding = Literal["ascii", "binary", "binary_compressed"]
+
+
+def looks_like_pcd(head: bytes) -> bool:
+    """Whether the first bytes of a file are those of a PCD header."""
+    for line in head.splitlines():
+        word = line.split(maxsplit=1)[:1]
+        if word and not word[0].startswith(b"#"):
+            return word[0].decode("ascii", "replace") in _KEYWORDS
+        if line.startswith(b"# .PCD"):
+            return True
+    return False
+
+
+@dataclass(frozen=True)
+class PcdSource:
+    """A PCD file.
+
+    VIEWPOINT is where the sensor stood: it is not applied to the coordinates (nor does PCL).
+    Coordinates may be of any numeric type; float64 ones arrive exactly.
+    """
+
+    path: str
+    """The file, as it was named."""
+    encoding: Encoding
+    """How its points are written."""
+    fields: tuple[tuple[str, str], ...]
+    """Name and type of every field."""
+    rows: BinaryRows | TextRows
+    """Where the points lie: the layout of the decoded rows for binary_compressed."""
+    size_bytes: int
+    """Size of the file [bytes]."""
+    packed_bytes: int = 0
+    """Size of the compressed points of binary_compressed [bytes]; else 0."""
+    unpacked_bytes: int = 0
+    """Size of the decoded points of binary_compressed [bytes]; else 0."""
+    notes: tuple[str, ...] = ()
+    """What else a user should know."""
+
+    def info(self) -> SourceInfo:
+        """What the header tells."""
+        return SourceInfo(
+            path=self.path,
+            format=f"pcd {self.encoding}",
+            size_bytes=self.size_bytes,
+            points=self.rows.count,
+            bounds=None,
+            fields=self.fields,
+            crs=None,
+            resident_bytes=self.packed_bytes + self.unpacked_bytes,
+            notes=self.notes,
+        )
+
+    def spans(self, points: int) -> list[Span]:
+        """Any pieces of a binary file; the other two are read from the beginning: one span."""
+        count = self.rows.count
+        return even_spans(count, points if self.encoding == "binary" else max(count, points))
+
+    def blocks(self, span: Span, block_points: int) -> Iterator[Block]:
+        """The points of a span in blocks; see `PointSource.blocks`."""
+        if self.encoding != "binary_compressed":
+            return self.rows.blocks(span, block_points)
+        return self._unpacked_blocks(span, block_points)
+
+    def _unpacked_blocks(self, span: Span, block_points: int) -> Iterator[Block]:
+        """All x stand first, then all y, …: each field is a column of the decoded bytes."""
+        rows = self.rows
+        whole_span(span, rows.count, self.path)
+        unpacked = self._unpack()
+        x, y, z = (
+            np.ndarray((rows.count,), c.dtype, unpacked.data, c.offset * rows.count)
+            for c in rows.columns
+        )
+        for step in steps(span, block_points):
+            part = slice(step.start, step.stop)
+            yield finite_block(x[part], y[part], z[part])
+
+    def _unpack(self) -> NDArray[np.uint8]:
+        data = self.rows.offset + 2 * _TWO_SIZES.itemsize
+        with Path(self.path).open("rb") as file:
+            file.seek(data)
+            packed = np.fromfile(file, np.uint8, self.packed_bytes)
+        unpacked = np.empty(self.unpacked_bytes, np.uint8)
+        damaged = lzf.decompress(packed, unpacked)
+        if damaged != lzf.WHOLE:
+            raise CorruptSourceError(
+                f"{self.path}: the compressed points are damaged at offset {data + damaged}: "
+                "copy the file again from where it came from"
+            )
+        return unpacked
+
+
+def open_pcd(path: str) -> PcdSource:
+    """A PCD file; its header is read and checked against the size of the file.
+
+    Raises:
+        CorruptSourceError: the header is incomplete, contradicts itself, names a type that PCD
+            does not have or has no x, y, z; or the file is too short for what it claims.
+    """
+    with Path(path).open("rb") as file:
+        header, offset = _read_header(file, path)
+        size_bytes = os.fstat(file.fileno()).st_size
+        encoding = _encoding(header, path)
+        layout = _Layout(header, path)
+        if encoding == "binary_compressed":
+            file.seek(offset)
+            sizes = np.frombuffer(file.read(2 * _TWO_SIZES.itemsize), np.uint8)
+            packed, unpacked = _compressed_sizes(sizes, layout, offset, size_bytes, path)
+            end = offset + 2 * _TWO_SIZES.itemsize + packed
+        else:
+            packed, unpacked, end = 0, 0, offset + layout.size * layout.count
+    if encoding == "ascii":
+        rows: BinaryRows | TextRows = TextRows(
+            path, offset, layout.words, layout.count, layout.text_columns
+        )
+    else:
+        rows = BinaryRows(path, offset, layout.size, layout.count, layout.columns)
+    if encoding != "binary_compressed":
+        rows.check_size(size_bytes)
+    left = size_bytes - end if encoding != "ascii" else 0
+    notes = (f"{left} bytes behind the last point are ignored",) if left > 0 else ()
+    return PcdSource(path, encoding, layout.fields, rows, size_bytes, packed, unpacked, notes)
+
+
+def _read_header(file: BinaryIO, path: str) -> tuple[dict[str, list[str]], int]:
+    """The words behind each keyword, and where the data starts."""
+    header: dict[str, list[str]] = {}
+    while file.tell() < _HEADER_MAX:
+        line = file.readline(_HEADER_MAX)
+        words = line.decode("ascii", "replace").split()
+        if not line.endswith(b"\n"):
+            break
+        if not words or words[0].startswith("#"):
+            continue
+        keyword = "FIELDS" if words[0] == "COLUMNS" else words[0]
+        if keyword not in (*_KEYWORDS, "DATA"):
+            raise CorruptSourceError(
+                f"{path}: unknown keyword {keyword[:40]!r} in its PCD header at offset "
+                f"{file.tell() - len(line)}"
+            )
+        if keyword in header:
+            raise CorruptSourceError(f"{path}: its PCD header has {keyword} twice")
+        header[keyword] = words[1:]
+        if keyword == "DATA":
+            return header, file.tell()
+    raise CorruptSourceError(
+        f"{path}: its PCD header has no whole DATA line up to offset {file.tell()}: the file is "
+        "cut short or damaged; copy it again from where it came from"
+    )
+
+
+def _encoding(header: dict[str, list[str]], path: str) -> Encoding:
+    match header["DATA"]:
+        case [("ascii" | "binary" | "binary_compressed") as encoding]:
+            return encoding
+    raise CorruptSourceError(
+        f"{path}: DATA {' '.join(header['DATA'])!r} in its PCD header: only ascii, binary and "
+        "binary_compressed exist"
+    )
+
+
+class _Layout:
+    """What the header says about a row: fields, types, size, number of rows."""
+
+    def __init__(self, header: dict[str, list[str]], path: str) -> None:
+        self._header, self._path = header, path
+        names = self._words("FIELDS")
+        sizes = self._numbers("SIZE", len(names))
+        kinds = self._words("TYPE", len(names))
+        counts = self._numbers("COUNT", len(names)) if "COUNT" in header else [1] * len(names)
+        types = [self._type(*field) for field in zip(names, kinds, sizes, strict=True)]
+        self.size = sum(t.itemsize * n for t, n in zip(types, counts, strict=True))
+        self.words = sum(counts)
+        self.fields = tuple(
+            (name, t.name if n == 1 else f"{t.name}[{n}]")
+            for name, t, n in zip(names, types, counts, strict=True)
+        )
+        self.columns = self._columns(names, types, counts, [t.itemsize for t in types])
+        self.text_columns = self._columns(names, types, counts, [1] * len(types))
+        self.count = self._points()
+
+    def _words(self, keyword: str, count: int | None = None) -> list[str]:
+        words = self._header.get(keyword)
+        if not words:
+            raise CorruptSourceError(f"{self._path}: its PCD header has no {keyword}")
+        if count is not None and len(words) != count:
+            raise CorruptSourceError(
+                f"{self._path}: {keyword} in its PCD header has {len(words)} values for {count} "
+                "FIELDS"
+            )
+        return words
+
+    def _numbers(self, keyword: str, count: int) -> list[int]:
+        words = self._words(keyword, count)
+        for word in words:
+            if not re.fullmatch(r"[0-9]{1,18}", word):
+                raise CorruptSourceError(
+                    f"{self._path}: {keyword} {word[:40]!r} in its PCD header is no whole number"
+                )
+        return [int(word) for word in words]
+
+    def _type(self, name: str, kind: str, size: int) -> np.dtype[Any]:
+        if size not in _SIZES.get(kind, ()):
+            raise CorruptSourceError(
+                f"{self._path}: field {name!r} has the unknown type TYPE {kind} SIZE {size}; PCD "
+                "has F of 4 and 8 bytes, I and U of 1, 2, 4 and 8"
+            )
+        return np.dtype(f"<{kind.lower()}{size}")
+
+    def _columns(
+        self, names: list[str], types: list[np.dtype[Any]], counts: list[int], widths: list[int]
+    ) -> Columns:
+        def column(name: str) -> Column:
+            if names.count(name) != 1:
+                raise CorruptSourceError(
+                    f"{self._path}: has {names.count(name)} fields {name!r} among "
+                    f"{' '.join(names)}; points need x, y and z"
+                )
+            i = names.index(name)
+            if counts[i] != 1:
+                raise CorruptSourceError(
+                    f"{self._path}: field {name!r} has COUNT {counts[i]}; a coordinate has 1"
+                )
+            before = zip(widths[:i], counts[:i], strict=True)
+            return Column(sum(width * n for width, n in before), types[i])
+
+        return column("x"), column("y"), column("z")
+
+    def _points(self) -> int:
+        """POINTS, or WIDTH x HEIGHT where an old file lacks it; both must agree."""
+        claims = [self._numbers("POINTS", 1)[0]] if "POINTS" in self._header else []
+        if "WIDTH" in self._header:
+            height = self._numbers("HEIGHT", 1)[0] if "HEIGHT" in self._header else 1
+            claims.append(self._numbers("WIDTH", 1)[0] * height)
+        if not claims:
+            raise CorruptSourceError(f"{self._path}: its PCD header has no POINTS")
+        if len(set(claims)) > 1:
+            raise CorruptSourceError(
+                f"{self._path}: POINTS {claims[0]} in its PCD header is not WIDTH x HEIGHT = "
+                f"{claims[1]}"
+            )
+        return claims[0]
+
+
+def _compressed_sizes(
+    sizes: NDArray[np.uint8], layout: _Layout, offset: int, size_bytes: int, path: str
+) -> tuple[int, int]:
+    """Bytes before and after decoding, checked before anything of that size is allocated."""
+    data = offset + 2 * _TWO_SIZES.itemsize
+    if size_bytes < data:
+        if layout.count == 0 and size_bytes == offset:
+            return 0, 0
+        raise CorruptSourceError(f"{path}: cut short at {size_bytes}, before its points")
+    packed, unpacked = (int(size) for size in sizes.view(_TWO_SIZES))
+    if data + packed > size_bytes:
+        raise CorruptSourceError(
+            f"{path}: claims {packed} compressed bytes from offset {data}, but the file ends at "
+            f"{size_bytes}: it is cut short; copy it again from where it came from"
+        )
+    if unpacked != layout.size * layout.count:
+        raise CorruptSourceError(
+            f"{path}: claims {unpacked} bytes of points at offset {offset + 4}, but its header "
+            f"claims {layout.count} points of {layout.size} bytes"
+        )
+    if unpacked > 100 * packed:
+        # three bytes of LZF become at most 264
+        raise CorruptSourceError(
+            f"{path}: claims {unpacked} bytes of points in {packed} compressed ones at offset "
+            f"{offset}, more than LZF can hold"
+        )
+    return packed, unpacked
+
+
+def write_pcd(
+    path: str | os.PathLike[str],
+    points: ArrayLike,
+    *,
+    fields: dict[str, ArrayLike] | None = None,
+    encoding: Encoding = "binary",
+) -> None:
+    """Write points as PCD; the file takes its name only once it is whole.
+
+    Args:
+        path: the file; an existing one is replaced.
+        points: (n, 3) coordinates [m]: float32 where that moves none by more than 0.1 mm, else
+            float64.
+        fields: further values per point, (n,) each, written with their own type.
+        encoding: how the points are written.
+
+    Raises:
+        UsageError: shapes or types that do not fit, or an encoding that PCD does not have.
+    """
+    table = table_of(as_points(points), fields)
+    if encoding == "ascii":
+        data = _as_text(table)
+    elif encoding == "binary":
+        data = table.tobytes()
+    elif encoding == "binary_compressed":
+        data = _packed(b"".join(table[name].tobytes() for name in table.dtype.names or ()))
+    else:
+        raise UsageError(f"encoding {encoding!r}: give ascii, binary or binary_compressed")
+    with writing_whole(path) as file:
+        file.write(_header_of(table, encoding))
+        file.write(data)
+
+
+def _header_of(table: NDArray[Any], encoding: str) -> bytes:
+    names = table.dtype.names or ()
+    types = [table.dtype[name] for name in names]
+    lines = (
+        "# .PCD v0.7 - Point Cloud Data file format",
+        "VERSION 0.7",
+        "FIELDS " + " ".join(names),
+        "SIZE " + " ".join(str(t.itemsize) for t in types),
+        "TYPE " + " ".join(t.kind.upper() for t in types),
+        "COUNT " + " ".join("1" for _ in types),
+        f"WIDTH {len(table)}",
+        "HEIGHT 1",
+        "VIEWPOINT 0 0 0 1 0 0 0",
+        f"POINTS {len(table)}",
+        f"DATA {encoding}",
+    )
+    return "".join(f"{line}\n" for line in lines).encode()
+
+
+def _as_text(table: NDArray[Any]) -> bytes:
+    """A line per point; every number in the fewest digits that read back the same."""
+    columns = [table[name].astype(str) for name in table.dtype.names or ()]
+    return "".join(f"{' '.join(row)}\n" for row in zip(*columns, strict=True)).encode()
+
+
+def _packed(raw: bytes) -> bytes:
+    if len(raw) > np.iinfo(_TWO_SIZES).max:
+        raise UsageError(
+            f"{len(raw)} bytes of points: binary_compressed holds 4 GiB, use binary or tiles"
+        )
+    unpacked = np.frombuffer(bytearray(raw), np.uint8)
+    packed = np.empty(len(raw) + len(raw) // 32 + 1, np.uint8)
+    length = lzf.compress(unpacked, packed)
+    sizes = np.array([length, len(raw)], _TWO_SIZES)
+    return sizes.tobytes() + packed[:length].tobytes()

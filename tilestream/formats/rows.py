@@ -1,0 +1,264 @@
+"""Points that lie row by row in a file, binary or as text, and what reading them has in common."""
+
+import math
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from itertools import islice, pairwise
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from tilestream.errors import CorruptSourceError, UsageError
+from tilestream.formats.base import Block, Span
+from tilestream.kernels.rows import finite_points
+from tilestream.records import Float64
+
+_LINE_MAX = 1 << 16
+"""Longest line of text that is read as one row [bytes]."""
+_FLOAT32_LOSS = 1e-4
+"""Largest rounding that a writer accepts before it chooses float64 [m]."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """Where a coordinate lies in a row."""
+
+    offset: int
+    """Bytes from the start of the row, or the number of the word in a row of text."""
+    dtype: np.dtype[Any]
+    """Its type, with byte order."""
+
+
+Columns = tuple[Column, Column, Column]
+"""x, y and z."""
+
+
+def even_spans(count: int, points: int) -> list[Span]:
+    """`count` points in spans of at most `points`, as equal as whole numbers allow."""
+    if points < 1:
+        raise UsageError(f"a span of {points} points: give at least 1")
+    pieces = math.ceil(count / points)
+    edges = [count * i // pieces for i in range(pieces + 1)] if pieces else []
+    return [Span(a, b) for a, b in pairwise(edges)]
+
+
+def steps(span: Span, block_points: int) -> Iterator[Span]:
+    """A span in pieces of `block_points`; the last one takes what is left."""
+    if block_points < 1:
+        raise UsageError(f"a block of {block_points} points: give at least 1")
+    for start in range(span.start, span.stop, block_points):
+        yield Span(start, min(start + block_points, span.stop))
+
+
+def whole_span(span: Span, count: int, path: str) -> None:
+    """Refuse a span that is not inside a source of `count` points."""
+    if not 0 <= span.start <= span.stop <= count:
+        raise UsageError(f"{path}: {span} is not inside its {count} points")
+
+
+def finite_block(x: NDArray[Any], y: NDArray[Any], z: NDArray[Any]) -> Block:
+    """The points of three columns of numbers, without those that are NaN or infinite."""
+    points = np.empty((len(x), 3))
+    kept = finite_points(_native(x), _native(y), _native(z), points)
+    return Block(points[:kept], dropped=len(x) - kept)
+
+
+def _native(column: NDArray[Any]) -> NDArray[Any]:
+    """The column as the kernel takes it: float32 or float64 in this machine's byte order."""
+    if column.dtype in (np.float32, np.float64) and column.dtype.isnative:
+        return column
+    return column.astype(np.float64)
+
+
+@dataclass(frozen=True)
+class BinaryRows:
+    """Rows of one size, one behind the other."""
+
+    path: str
+    """The file."""
+    offset: int
+    """Where the first row starts [bytes]."""
+    size: int
+    """Bytes of a row."""
+    count: int
+    """Number of rows that the header claims."""
+    columns: Columns
+    """Where x, y and z lie in a row."""
+
+    def check_size(self, file_bytes: int) -> None:
+        """Refuse a file that is too short for the rows that it claims."""
+        needed = self.offset + self.size * self.count
+        if needed > file_bytes:
+            raise CorruptSourceError(
+                f"{self.path}: its header claims {self.count} points of {self.size} bytes from "
+                f"offset {self.offset}, which ends at {needed}, but the file ends at {file_bytes}: "
+                "it is cut short or its header is wrong; copy it again from where it came from"
+            )
+
+    def blocks(self, span: Span, block_points: int) -> Iterator[Block]:
+        """The points of a span; see `PointSource.blocks`."""
+        whole_span(span, self.count, self.path)
+        room = np.empty(self.size * min(block_points, span.stop - span.start), np.uint8)
+        with Path(self.path).open("rb", buffering=0) as file:
+            file.seek(self.offset + span.start * self.size)
+            for step in steps(span, block_points):
+                n = step.stop - step.start
+                self._fill(file, room[: n * self.size], self.offset + step.start * self.size)
+                yield finite_block(*(self._view(room, n, column) for column in self.columns))
+
+    def _view(self, room: NDArray[np.uint8], n: int, column: Column) -> NDArray[Any]:
+        return np.ndarray((n,), column.dtype, room.data, column.offset, (self.size,))
+
+    def _fill(self, file: Any, room: NDArray[np.uint8], offset: int) -> None:
+        filled = 0
+        while filled < len(room):
+            got = file.readinto(room[filled:].data)
+            if not got:
+                raise CorruptSourceError(
+                    f"{self.path}: ends at offset {offset + filled}, in the middle of its points: "
+                    "it became shorter while it was read"
+                )
+            filled += got
+
+
+@dataclass(frozen=True)
+class TextRows:
+    """Rows of numbers as text, a line each, in words separated by white space."""
+
+    path: str
+    """The file."""
+    offset: int
+    """Where the first row starts [bytes]."""
+    words: int
+    """Numbers in a row."""
+    count: int
+    """Number of rows that the header claims."""
+    columns: Columns
+    """Which words are x, y and z."""
+    more_follows: bool = False
+    """Whether something else may come behind the last row."""
+
+    def check_size(self, file_bytes: int) -> None:
+        """Refuse a file that is too short for the rows that it claims, two bytes a number."""
+        needed = self.offset + 2 * self.words * self.count
+        if needed > file_bytes:
+            raise CorruptSourceError(
+                f"{self.path}: its header claims {self.count} points of {self.words} numbers, at "
+                f"least {needed} bytes, but the file ends at {file_bytes}: it is cut short or its "
+                "header is wrong; copy it again from where it came from"
+            )
+
+    def blocks(self, span: Span, block_points: int) -> Iterator[Block]:
+        """The points of a span; see `PointSource.blocks`. What is before it is read and skipped.
+
+        Raises:
+            CorruptSourceError: a row has too few or too many words or one that is no number, rows
+                are missing or left over, or the last one does not end with a newline (so that its
+                last number may be cut short).
+        """
+        whole_span(span, self.count, self.path)
+        with Path(self.path).open("rb") as file:
+            file.seek(self.offset)
+            lines = (line for line in iter(partial(file.readline, _LINE_MAX), b"") if line.strip())
+            for _ in islice(lines, span.start):
+                pass
+            for step in steps(span, block_points):
+                rows = list(islice(lines, step.stop - step.start))
+                self._check_rows(rows, step)
+                table = self._numbers(rows, step)
+                yield finite_block(*(table[:, column.offset] for column in self.columns))
+            if span.stop == self.count and not self.more_follows:
+                self._check_end(next(lines, b""))
+
+    def _check_rows(self, rows: list[bytes], step: Span) -> None:
+        if len(rows) < step.stop - step.start:
+            raise CorruptSourceError(
+                f"{self.path}: ends after {step.start + len(rows)} of {self.count} points: it is "
+                "cut short or its header is wrong; copy it again from where it came from"
+            )
+        if not rows[-1].endswith(b"\n"):
+            raise CorruptSourceError(
+                f"{self.path}: point {step.stop - 1} does not end with a newline, so its last "
+                "number may be cut short; if the file is whole, add a newline at its end"
+            )
+
+    def _numbers(self, rows: list[bytes], step: Span) -> Float64:
+        try:
+            table = np.loadtxt(rows, dtype=np.float64, comments=None, ndmin=2)
+        except (ValueError, OverflowError) as error:
+            raise CorruptSourceError(
+                f"{self.path}: points {step.start} to {step.stop - 1} are no table of "
+                f"{self.words} numbers a row, rows counted from point {step.start}: {error}"
+            ) from error
+        if table.shape[1] != self.words:
+            raise CorruptSourceError(
+                f"{self.path}: point {step.start} has {table.shape[1]} numbers, its header says "
+                f"{self.words}"
+            )
+        return table
+
+    def _check_end(self, line: bytes) -> None:
+        if line:
+            raise CorruptSourceError(
+                f"{self.path}: more rows than the {self.count} points that its header claims, "
+                f"the next one is {line[:60]!r}"
+            )
+
+
+def as_points(points: ArrayLike) -> Float64:
+    """(n, 3) float64 from what a caller gave to a writer."""
+    table = np.asarray(points, dtype=np.float64)
+    if table.ndim != 2 or table.shape[1] != 3:
+        raise UsageError(f"points of shape {table.shape}: give (n, 3)")
+    return table
+
+
+def coordinate_type(points: Float64) -> DTypeLike:
+    """float32 where that moves no coordinate by more than 0.1 mm, else float64."""
+    finite = points[np.isfinite(points).all(axis=1)]
+    with np.errstate(over="ignore"):
+        loss = np.abs(finite - finite.astype(np.float32))
+    return np.float32 if loss.max(initial=0.0) <= _FLOAT32_LOSS else np.float64
+
+
+def table_of(points: Float64, fields: dict[str, ArrayLike] | None) -> NDArray[Any]:
+    """x, y, z and further fields as one structured array, a row per point."""
+    xyz = np.dtype(coordinate_type(points)).newbyteorder("<")
+    further = {name: np.asarray(values) for name, values in (fields or {}).items()}
+    for name, values in further.items():
+        if values.shape != (len(points),) or values.dtype.kind not in "fiu":
+            raise UsageError(
+                f"field {name!r}: {values.dtype} of shape {values.shape}; give ({len(points)},) "
+                "numbers, one per point"
+            )
+        if name in ("x", "y", "z") or not name.isidentifier():
+            raise UsageError(f"field {name!r}: give a name of letters, digits and _, not x, y or z")
+    types = [(name, xyz) for name in "xyz"]
+    types += [(name, values.dtype.newbyteorder("<")) for name, values in further.items()]
+    table = np.empty(len(points), np.dtype(types))
+    for axis, name in enumerate("xyz"):
+        table[name] = points[:, axis]
+    for name, values in further.items():
+        table[name] = values
+    return table
+
+
+@contextmanager
+def writing_whole(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    """A file to write that takes its name only once it is whole; nothing is left if that fails."""
+    target = Path(path)
+    part = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        with part.open("wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(target)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
