@@ -1,9 +1,14 @@
 """What passes between the rooms: frozen values, a line under every field, frames in names."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from tilestream.errors import UsageError
+from tilestream.kernels import cells as kernels
+from tilestream.tiling import MM_PER_M, whole_mm
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -25,6 +30,9 @@ class Scan:
     """(n,) index of the beam, as recorded; None where the log has none."""
     time_offset: Float64 | None = None
     """(n,) time of each point minus `stamp_ns` [s]; None where the log has none."""
+    dropped: int = 0
+    """Points of the recorded scan that are not here because they were no returns: not finite, or
+    at the lidar's own origin."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,3 +45,125 @@ class Trajectory:
     """(k, 4, 4) poses at these times."""
     frame: str = ""
     """Name of the frame that moves, as recorded."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Cells:
+    """Normal distributions on the map's lattice: the NDT map, or a part of it.
+
+    Made by `cells_of`, by `tile.cells`, or from arrays in any order; the rows are then sorted by
+    voxel index, lexicographically, and the arrays are copies of their own type.
+
+    Raises:
+        UsageError: arrays of the wrong shape or of unequal length, values that are not finite, a
+            covariance that is not symmetric, a count below 1, two cells of one index, a cell size
+            that is not a positive number of whole millimetres.
+    """
+
+    index: Int64
+    """(n, 3) voxel index: floor of the coordinates over the cell size, lexicographic."""
+    count: Int64
+    """(n,) number of map points in the voxel."""
+    mean: Float64
+    """(n, 3) mean of these points [m, map frame]."""
+    covariance: Float64
+    """(n, 3, 3) their unbiased covariance [m^2], as it is: not regularised."""
+    cell_size: float = 2.0
+    """Edge of a voxel [m], whole millimetres."""
+
+    def __post_init__(self) -> None:
+        if whole_mm(self.cell_size, "cell_size") <= 0:
+            raise UsageError(f"cell_size is {self.cell_size!r} m: give more than 0")
+        index = _whole(self.index, "index")
+        n = len(index)
+        count = _whole(self.count, "count")
+        mean = np.array(self.mean, np.float64, order="C")
+        covariance = np.array(self.covariance, np.float64, order="C")
+        for name, array, shape in (
+            ("index", index, (n, 3)),
+            ("count", count, (n,)),
+            ("mean", mean, (n, 3)),
+            ("covariance", covariance, (n, 3, 3)),
+        ):
+            if array.shape != shape:
+                raise UsageError(f"Cells: {name} has shape {array.shape}, expected {shape}")
+            if not np.isfinite(array).all():
+                raise UsageError(f"Cells: {name} has values that are not finite")
+        if n and count.min() < 1:
+            raise UsageError("Cells: a count is below 1; a cell has points")
+        scale = np.abs(covariance).max(axis=(1, 2), initial=0.0)
+        skew = np.abs(covariance - covariance.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0)
+        if (skew > 1e-6 * scale).any():
+            row = int(np.argmax(skew - 1e-6 * scale))
+            raise UsageError(f"Cells: the covariance of row {row} is not symmetric")
+        order = kernels.lexicographic_order(index)
+        index = index[order]
+        twice = (index[1:] == index[:-1]).all(axis=1)
+        if twice.any():
+            voxel = tuple(index[1:][twice][0].tolist())
+            raise UsageError(f"Cells: two cells have the index {voxel}; each voxel has one")
+        object.__setattr__(self, "index", index)
+        object.__setattr__(self, "count", count[order])
+        object.__setattr__(self, "mean", mean[order])
+        object.__setattr__(self, "covariance", covariance[order])
+        object.__setattr__(self, "cell_size", float(self.cell_size))
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def __repr__(self) -> str:
+        text = f"Cells({len(self)} of {self.cell_size:g} m"
+        if len(self):
+            low, high = self.mean.min(axis=0), self.mean.max(axis=0)
+            spans = zip("xyz", low, high, strict=True)
+            text += ", " + ", ".join(f"{a} {lo:.1f} to {hi:.1f}" for a, lo, hi in spans) + " m"
+            text += f", {self.count.sum()} points"
+        return text + ")"
+
+    @property
+    def cell_mm(self) -> int:
+        """Edge of a voxel [mm]."""
+        return round(self.cell_size * MM_PER_M)
+
+    @cached_property
+    def _eigen(self) -> tuple[Float64, Float64]:
+        return kernels.eigen(self.covariance)
+
+    @cached_property
+    def _regularised(self) -> tuple[Float64, Float64]:
+        return kernels.regularise(*self._eigen)
+
+    @property
+    def eigenvalues(self) -> Float64:
+        """(n, 3) raw eigenvalues of the covariance [m^2], descending; those below 0 are 0."""
+        return self._eigen[0]
+
+    @property
+    def eigenvectors(self) -> Float64:
+        """(n, 3, 3) unit eigenvectors in the columns: [:, :, 0] belongs to the largest."""
+        return self._eigen[1]
+
+    @cached_property
+    def normal(self) -> Float64:
+        """(n, 3) unit normals with the map-wide sign: the largest component is positive."""
+        return kernels.normals(*self._eigen)
+
+    @property
+    def regularised(self) -> Float64:
+        """(n, 3, 3) covariance [m^2] with eigenvalues max(lam_i, 0.01 lam1, (0.01 m)^2)."""
+        return self._regularised[0]
+
+    @property
+    def precision(self) -> Float64:
+        """(n, 3, 3) inverse of the regularised covariance [1/m^2]."""
+        return self._regularised[1]
+
+
+def _whole(values: ArrayLike, name: str) -> Int64:
+    """A copy as int64, refusing numbers that are not whole."""
+    given = np.asarray(values)
+    if given.dtype.kind not in "iuf":
+        raise UsageError(f"Cells: {name} has type {given.dtype}, expected whole numbers")
+    if given.dtype.kind == "f" and not (np.isfinite(given) & (given == np.rint(given))).all():
+        raise UsageError(f"Cells: {name} has values that are no whole numbers")
+    return np.array(given, np.int64, order="C")
