@@ -10,12 +10,13 @@ import tilestream
 
 ROOT = Path(tilestream.__file__).parent
 FLOORS = (
-    ("errors",),
-    ("tiling", "config", "sensors"),
-    ("kernels",),
+    ("errors", "version"),
+    ("tiling", "config"),
+    ("kernels", "sensors"),
     ("records",),
+    ("ndt",),
     ("store", "formats", "simulation"),
-    ("ndt", "localization", "factors", "forest"),
+    ("localization", "factors", "forest"),
     ("report", "ingest"),
     ("dataflow",),
     ("cli",),
@@ -31,7 +32,7 @@ KNOWN_ONLY_BY = {
     "open3d": {"simulation", "formats"},
     "typer": {"cli"},
 }
-INSIDE_DATAFLOW = ("plan", "tasks", "run", "dashboard")
+INSIDE_DATAFLOW = ("plan", "tasks", "run", "jobs", "dashboard")
 
 
 def modules() -> list[Path]:
@@ -71,9 +72,9 @@ def broken_arrows(path: Path, source: str) -> list[str]:
         if target not in LEVEL:
             found.append(f"{path.name}:{node.lineno} imports {name}, of no floor")
         elif target == room:
-            if room == "dataflow" and path.stem in INSIDE_DATAFLOW and len(rest) > 1:
-                if INSIDE_DATAFLOW.index(rest[1]) >= INSIDE_DATAFLOW.index(path.stem):
-                    found.append(f"{path.name}:{node.lineno} {path.stem} imports {rest[1]}")
+            steps = INSIDE_DATAFLOW if room == "dataflow" and len(rest) > 1 else ()
+            if path.stem in steps and steps.index(rest[1]) >= steps.index(path.stem):
+                found.append(f"{path.name}:{node.lineno} {path.stem} imports {rest[1]}")
         elif LEVEL[target] >= LEVEL[room]:
             found.append(f"{path.name}:{node.lineno} {room} imports {target}")
     return found

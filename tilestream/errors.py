@@ -63,3 +63,12 @@ class TaskError(TilestreamError):
 
 class PlanError(TilestreamError):
     """A job that does not fit what it was promised (memory, disk); says what to change."""
+
+
+class PartialError(TaskError):
+    """A job that ended with some of its work failed; everything else is done and usable."""
+
+    def __init__(self, what: str, failures: dict[str, str]) -> None:
+        lines = "".join(f"\n  {name}: {reason}" for name, reason in sorted(failures.items()))
+        super().__init__(what + lines)
+        self.failures = failures

@@ -3,13 +3,13 @@
 import itertools
 from typing import Annotated, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from tilestream.config import Settings
 
 
-class Sensor(BaseModel):
+class Sensor(Settings):
     """A spinning lidar."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str
     """What to call it in tables and reports."""

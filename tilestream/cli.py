@@ -1,0 +1,290 @@
+"""The commands: parse, call, print. The only place that exits.
+
+Exit codes: 0 all good; 1 some sources, tiles or scans failed and are listed, the rest is done;
+2 usage: nothing was done.
+"""
+
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from importlib import resources
+from pathlib import Path
+from tempfile import mkdtemp
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+
+from tilestream.config import IngestSettings
+from tilestream.dataflow import jobs
+from tilestream.dataflow.plan import DEFAULT_MEMORY, Plan, megabytes
+from tilestream.dataflow.run import Watch, dask_client
+from tilestream.dataflow.tasks import Outcome
+from tilestream.errors import (
+    PartialError,
+    PlanError,
+    SourceNotFoundError,
+    StoreNotFoundError,
+    TilestreamError,
+    UsageError,
+)
+from tilestream.formats import describe
+from tilestream.formats.base import SourceInfo
+from tilestream.store import POINTS, TileStore, open_store
+from tilestream.version import VERSION
+
+app = typer.Typer(
+    name="tilestream",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+out = Console()
+err = Console(stderr=True)
+
+SCHEDULER = typer.Option(help="Run on this Dask scheduler, e.g. tcp://10.0.0.1:8786.")
+WORKERS = typer.Option(min=1, help="Worker processes on this machine; 1: this process.")
+MEMORY = typer.Option(help="What one task may use, e.g. 512MB or 2GB.")
+
+
+@app.callback(invoke_without_command=True)
+def root(
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+    debug: Annotated[  # noqa: ARG001 - `run` takes it from anywhere on the line
+        bool, typer.Option("--debug", help="With any command: show the traceback of an error.")
+    ] = False,
+) -> None:
+    """The localization error of a LiDAR vehicle at every metre, from the map alone."""
+    if version:
+        out.print(VERSION, highlight=False)
+        raise typer.Exit
+
+
+def parse_bytes(text: str) -> int:
+    """`512MB` or `2GB` as bytes (powers of ten).
+
+    Raises:
+        UsageError: it is not of that form.
+    """
+    for unit, factor in (("KB", 10**3), ("MB", 10**6), ("GB", 10**9), ("TB", 10**12)):
+        number = text.strip().upper().removesuffix(unit)
+        if number != text.strip().upper():
+            try:
+                return int(float(number) * factor)
+            except ValueError:
+                break
+    raise UsageError(f"{text!r} is no amount of memory: give a form like 512MB or 2GB")
+
+
+@contextmanager
+def progress() -> Iterator[Watch]:
+    """A progress bar per stage on stderr; failures are printed as they happen."""
+    columns = (
+        TextColumn("{task.description:>8}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=err, transient=not err.is_terminal) as bar:
+        rows: dict[str, TaskID] = {}
+
+        def watch(outcome: Outcome, ended: int, total: int) -> None:
+            if outcome.stage not in rows:
+                rows[outcome.stage] = bar.add_task(outcome.stage, total=total)
+            bar.update(rows[outcome.stage], completed=ended, total=total)
+            if not outcome.ok:
+                bar.console.print(f"[red]failed[/] {outcome.key}: ", end="")
+                bar.console.print(outcome.reason, markup=False, highlight=False)
+
+        yield watch
+
+
+def tile_table(store: TileStore) -> Table:
+    """The tiles of a store with status, counts and extents."""
+    table = Table(title=str(store), title_justify="left")
+    for column in ("tile", "status", "points", "read", "lowest [m]", "highest [m]", "reason"):
+        table.add_column(column, justify="right" if column in ("points", "read") else "left")
+    for key, mark in store.marks(POINTS).items():
+        facts = mark.facts
+        lowest, highest = (
+            " ".join(f"{value:.1f}" for value in facts.get(end, ()))
+            for end in ("lowest", "highest")
+        )
+        points, read = (f"{facts[name]:,}" if name in facts else "" for name in ("points", "read"))
+        table.add_row(str(key), mark.status, points, read, lowest, highest, mark.reason)
+    return table
+
+
+def plan_table(plan: Plan) -> Table:
+    """The stages of a plan with their tasks and promised memory."""
+    table = Table(title="plan", title_justify="left")
+    for column in ("stage", "tasks", "promised memory per task"):
+        table.add_column(column, justify="left" if column == "stage" else "right")
+    for stage, count, promise in plan.describe():
+        table.add_row(stage, str(count), megabytes(promise))
+    return table
+
+
+def print_sources(store: TileStore) -> None:
+    """What an ingest read, a line per source."""
+    for source in store.sources():
+        dropped = f", {source['dropped']:,} not finite and dropped" if source["dropped"] else ""
+        out.print(
+            f"{source['path']}: {source['format']}, {source['points']:,} points{dropped}",
+            highlight=False,
+            markup=False,
+            soft_wrap=True,
+        )
+        for note in source["notes"]:
+            out.print(f"  {note}", highlight=False, markup=False, soft_wrap=True)
+
+
+@app.command()
+def ingest(
+    sources: Annotated[
+        list[str], typer.Argument(help="Files, globs, Autoware map directories, mixed.")
+    ],
+    store: Annotated[str, typer.Option(help="The tile store: a path or an fsspec URL.")],
+    tile_size: Annotated[float, typer.Option(help="Edge of a tile [m].")] = 100.0,
+    halo: Annotated[float, typer.Option(help="What tasks read around a tile [m].")] = 10.0,
+    map_leaf: Annotated[
+        float, typer.Option(help="Thin to one point per voxel [m]; 0: keep.")
+    ] = 0.2,
+    crs: Annotated[str | None, typer.Option(help="CRS of the map, e.g. EPSG:6677.")] = None,
+    memory: Annotated[str, MEMORY] = megabytes(DEFAULT_MEMORY).replace(" ", "").replace(",", ""),
+    scheduler: Annotated[str | None, SCHEDULER] = None,
+    workers: Annotated[int, WORKERS] = 1,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan, do nothing.")] = False,
+) -> None:
+    """Make a tile store from point clouds, map directories and logs of drives."""
+    settings = IngestSettings(tile_size=tile_size, halo=halo, map_leaf=map_leaf, crs=crs)
+    allowed = parse_bytes(memory)
+    if dry_run:
+        out.print(plan_table(jobs.plan_ingest(sources, store, settings, allowed)))
+        return
+    failed: PartialError | None = None
+    with dask_client(scheduler, workers, allowed) as client, progress() as watch:
+        try:
+            jobs.ingest(
+                sources, store, **settings.model_dump(), client=client, memory=allowed, watch=watch
+            )
+        except PartialError as error:
+            failed = error
+    made = open_store(store)
+    print_sources(made)
+    out.print(tile_table(made))
+    if failed is not None:
+        raise failed
+
+
+@app.command()
+def status(
+    store: Annotated[str, typer.Argument(help="The tile store.")],
+    as_json: Annotated[bool, typer.Option("--json", help="For machines.")] = False,
+) -> None:
+    """Show the tiles of a store: counts, extents, status and reasons."""
+    opened = open_store(store)
+    marks = opened.marks(POINTS)
+    failures = {f"tile {k}": m.reason for k, m in marks.items() if m.status == "failed"}
+    failures |= {s["path"]: s["reason"] for s in opened.sources() if s["reason"]}
+    if as_json:
+        print_json(
+            {
+                "url": opened.url,
+                "settings": asdict(opened.settings),
+                "sources": opened.sources(),
+                "tiles": {str(key): asdict(mark) for key, mark in marks.items()},
+            }
+        )
+    else:
+        out.print(tile_table(opened))
+    if failures:
+        raise PartialError(f"{store}: {len(failures)} sources or tiles failed:", failures)
+
+
+@app.command()
+def info(
+    file: Annotated[str, typer.Argument(help="Any supported file, log or map directory.")],
+    as_json: Annotated[bool, typer.Option("--json", help="For machines.")] = False,
+) -> None:
+    """Show what is in a file or log: points, bounds, fields, topics, CRS."""
+    found = describe(file)
+    if as_json:
+        print_json(asdict(found))
+    else:
+        out.print(info_table(found))
+
+
+def info_table(found: SourceInfo) -> Table:
+    """What is in a file, a line per fact."""
+    table = Table(show_header=False, title=found.path, title_justify="left")
+    table.add_row("format", found.format)
+    table.add_row("size", f"{found.size_bytes:,} bytes")
+    table.add_row(
+        "points", "only reading it tells" if found.points is None else f"{found.points:,}"
+    )
+    if found.bounds:
+        for name, corner in zip(("lowest [m]", "highest [m]"), found.bounds, strict=True):
+            table.add_row(name, "  ".join(f"{value:.3f}" for value in corner))
+    table.add_row("fields", ", ".join(f"{name}: {kind}" for name, kind in found.fields))
+    table.add_row("CRS", found.crs or "none in the file")
+    for note in found.notes:
+        table.add_row("note", note)
+    return table
+
+
+@app.command()
+def demo(
+    store: Annotated[str | None, typer.Option(help="Where to; default: a new folder.")] = None,
+) -> None:
+    """Ingest the small point cloud that ships with tilestream and show its tiles."""
+    place = store or str(Path(mkdtemp(prefix="tilestream-demo-")) / "map.zarr")
+    with (
+        resources.as_file(resources.files("tilestream") / "data" / "street.laz") as cloud,
+        progress() as watch,
+    ):
+        made = jobs.ingest(cloud, place, tile_size=20.0, watch=watch)
+    out.print(tile_table(made))
+    out.print(f"The tile store is at {place}", highlight=False, soft_wrap=True)
+
+
+def print_json(value: object) -> None:
+    """One JSON document on stdout."""
+    sys.stdout.write(json.dumps(value, indent=2, sort_keys=True, default=str) + "\n")
+
+
+def main() -> None:
+    """The entry point: run a command, turn errors into one clear line and an exit code."""
+    sys.exit(run(sys.argv[1:]))
+
+
+def run(arguments: list[str]) -> int:
+    """Run a command line and return its exit code."""
+    debug = "--debug" in arguments
+    try:
+        app(args=[a for a in arguments if a != "--debug"], prog_name="tilestream")
+    except SystemExit as end:
+        return int(end.code or 0)
+    except (UsageError, SourceNotFoundError, StoreNotFoundError, PlanError) as error:
+        return _report(error, debug, 2)
+    except (TilestreamError, OSError) as error:
+        return _report(error, debug, 1)
+    return 0
+
+
+def _report(error: Exception, debug: bool, code: int) -> int:
+    if debug:
+        err.print_exception()
+    err.print(f"error: {error}", markup=False, highlight=False, soft_wrap=True)
+    return code

@@ -1,0 +1,1 @@
+"""The dataflow over tiles: plan (what will run), tasks (their bodies), run (how)."""

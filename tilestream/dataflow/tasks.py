@@ -1,0 +1,78 @@
+"""Each stage's body: open the store, call the pure function, return a small summary."""
+
+import time
+import traceback
+from dataclasses import dataclass
+from functools import singledispatch
+
+from tilestream import ingest
+from tilestream.dataflow.plan import MergeTask, ScatterTask, Task
+from tilestream.errors import TaskError, TilestreamError
+from tilestream.ingest import Fragment
+from tilestream.store import Mark, open_store
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a task."""
+
+    key: str
+    """The task's key."""
+    stage: str
+    """The task's stage."""
+    result: Fragment | Mark | None
+    """Its small summary; None where it failed."""
+    reason: str = ""
+    """Why it failed; empty where it did not."""
+    seconds: float = 0.0
+    """How long it ran [s]."""
+    details: str = ""
+    """The traceback of a failure, for --debug."""
+
+    @property
+    def ok(self) -> bool:
+        """Whether the task is done."""
+        return not self.reason
+
+
+@singledispatch
+def perform(task: Task) -> Fragment | Mark:
+    """Do the work of a task; what it raises is its failure."""
+    raise TaskError(f"{task.key}: no body for tasks of type {type(task).__name__}")
+
+
+@perform.register
+def _scatter(task: ScatterTask) -> Fragment:
+    return ingest.scatter(
+        open_store(task.store_url),
+        task.name,
+        task.source,
+        task.span,
+        task.block_points,
+        task.identity,
+        dict(task.options),
+    )
+
+
+@perform.register
+def _merge(task: MergeTask) -> Mark:
+    store = open_store(task.store_url)
+    return ingest.merge(store, task.tile, task.pieces, task.mark, task.strips, task.batch)
+
+
+def attempt(task: Task) -> Outcome:
+    """Do the work of a task and say what became of it; never raises."""
+    began = time.perf_counter()
+    try:
+        result = perform(task)
+    except TilestreamError as error:
+        reason, details = str(error), traceback.format_exc()
+    except MemoryError:
+        reason, details = "out of memory: allow less work at a time (--memory)", ""
+    except OSError as error:
+        reason, details = f"{error} ({type(error).__name__})", traceback.format_exc()
+    except Exception as error:  # noqa: BLE001 - whatever fails is listed, and the others go on
+        reason, details = f"{type(error).__name__}: {error}", traceback.format_exc()
+    else:
+        return Outcome(task.key, task.stage, result, seconds=time.perf_counter() - began)
+    return Outcome(task.key, task.stage, None, reason, time.perf_counter() - began, details)
