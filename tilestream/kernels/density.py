@@ -5,14 +5,6 @@ p(y; c) = exp(-d2/2 (y - mu)^T Sigma'^-1 (y - mu)); the score of a point is -d1 
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
-FLOOR_RATIO = 0.01
-"""Least eigenvalue of a regularised covariance, as a share of the largest one."""
-FLOOR_M2 = 0.01**2
-"""Least eigenvalue of a regularised covariance [m^2]: a standard deviation of 1 cm."""
-
 
 def magnusson_constants(cell_size: float, outlier_ratio: float = 0.55) -> tuple[float, float]:
     """The constants (d1, d2) that approximate Magnusson's mixture of normal and uniform.
@@ -32,21 +24,3 @@ def magnusson_constants(cell_size: float, outlier_ratio: float = 0.55) -> tuple[
     d1 = -math.log(c1 + c2) - d3
     d2 = -2.0 * math.log((-math.log(c1 * math.exp(-0.5) + c2) - d3) / d1)
     return d1, d2
-
-
-def regularised(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Sigma': the same eigenvectors, lam_i' = max(lam_i, 0.01 lam1, (0.01 m)^2).
-
-    Args:
-        covariance: (m, 3, 3) symmetric covariances [m^2]; singular ones are fine.
-
-    Returns:
-        (m, 3, 3) symmetric, positive definite [m^2]; a row depends on its own covariance only.
-    """
-    lam, vectors = np.linalg.eigh(covariance)
-    floor = np.maximum(FLOOR_RATIO * lam[:, 2:], FLOOR_M2)
-    scaled = vectors * np.maximum(lam, floor)[:, None, :]
-    # Nine plain sums: a batched matmul may take another path for another batch size.
-    product = (scaled[:, :, None, :] * vectors[:, None, :, :]).sum(axis=-1)
-    symmetric: NDArray[np.float64] = 0.5 * (product + product.transpose(0, 2, 1))
-    return symmetric
