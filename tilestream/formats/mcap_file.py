@@ -1,0 +1,304 @@
+"""The MCAP container: where each message lies, every checksum tested, what a cut file still holds.
+
+Works with a summary and chunk index, without them, and on a file that was cut short: then every
+record that is whole is read, and `McapFile.lost` says from which byte on nothing is.
+Format: mcap.dev/spec.
+"""
+
+import io
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.records import Channel, Chunk, Schema
+from mcap.stream_reader import CRCValidationError, get_chunk_data_stream
+from mcap.summary import Summary
+
+from tilestream.errors import CorruptSourceError, SourceNotFoundError, UnknownFormatError
+
+MAGIC = b"\x89MCAP0\r\n"
+RECORD_HEAD = struct.Struct("<BQ")
+MESSAGE_HEAD = struct.Struct("<HIQQ")
+FOOTER = struct.Struct("<BQQQI")
+LARGEST_CHUNK = 4 * 2**30
+"""Bytes that a chunk may claim to unpack to; more is taken for damage."""
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of a log."""
+
+    name: str
+    """As recorded, e.g. `/points`."""
+    type: str
+    """Message type without the `msg` part, e.g. `sensor_msgs/PointCloud2`."""
+    encoding: str
+    """Encoding of its messages, e.g. `cdr`."""
+    messages: int
+    """Messages that the file holds."""
+
+
+@dataclass(frozen=True, eq=False)
+class Message:
+    """A message as it lies in the file."""
+
+    topic: str
+    """Name of its topic."""
+    log_time: int
+    """When it was recorded [ns]."""
+    record: int
+    """Offset in the file of the chunk, or of the message outside of chunks, that holds it."""
+    start: int
+    """Offset of its content in the unpacked record."""
+    unpacked: int
+    """Size of the unpacked record [bytes]."""
+    data: memoryview
+    """Its content."""
+
+
+class McapFile:
+    """An MCAP file that is open for reading.
+
+    Args:
+        path: the file.
+        topics: False leaves out what only `unpack` does not need: summary and topics.
+
+    Raises:
+        SourceNotFoundError: no such file.
+        UnknownFormatError: the file does not begin as an MCAP file does.
+        CorruptSourceError: a checksum fails, or records contradict each other; names file, offset.
+    """
+
+    def __init__(self, path: str, *, topics: bool = True) -> None:
+        self.path = path
+        try:
+            self._stream = Path(path).open("rb")  # noqa: SIM115 - __exit__ closes it
+        except FileNotFoundError:
+            raise SourceNotFoundError(f"{path}: no such file") from None
+        except IsADirectoryError:
+            raise UnknownFormatError(
+                f"{path}: a directory, not an MCAP file; name the .mcap files in it"
+            ) from None
+        try:
+            self.size = self._stream.seek(0, io.SEEK_END)
+            self.whole = self._check_magic()
+            self.lost: str | None = None
+            self._channels: dict[int, tuple[str, str, str]] = {}
+            self._schemas: dict[int, str] = {}
+            self._summary = self._read_summary() if self.whole and topics else None
+            self.topics = self._count_topics() if topics else ()
+        except BaseException:
+            self._stream.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._stream.close()
+
+    def messages(self, topics: Iterable[str]) -> Iterator[Message]:
+        """The messages of some topics in the file's order; chunks that hold none of them are
+        passed over where the file has an index.
+        """
+        wanted = set(topics)
+        for record, content in self._contents(wanted):
+            for opcode, start, stop in self._inner_records(record, content):
+                if opcode != Opcode.MESSAGE:
+                    self._learn(opcode, content[start:stop])
+                    continue
+                if stop - start < MESSAGE_HEAD.size:
+                    raise self._corrupt(record, "holds a message shorter than its own head")
+                channel, _, log_time, _ = MESSAGE_HEAD.unpack_from(content, start)
+                if channel not in self._channels:
+                    raise self._corrupt(record, f"holds a message of the unknown channel {channel}")
+                topic = self._channels[channel][0]
+                if topic in wanted:
+                    start += MESSAGE_HEAD.size
+                    data = memoryview(content)[start:stop]
+                    yield Message(topic, log_time, record, start, len(content), data)
+
+    def unpack(self, record: int) -> bytes:
+        """The records inside the chunk at an offset of the file, or the record itself where a
+        message lies outside of chunks. Tests the chunk's CRC.
+        """
+        opcode, content = self._record(record)
+        return self._unpacked(record, opcode, content)
+
+    def _check_magic(self) -> bool:
+        head = self._read(0, len(MAGIC))
+        if head != MAGIC[: len(head)]:
+            raise UnknownFormatError(
+                f"{self.path}: not an MCAP file (it begins with {head!r}); rename it or convert it"
+            )
+        if len(head) < len(MAGIC):
+            raise CorruptSourceError(
+                f"{self.path}: cut short after {self.size} bytes; copy it anew"
+            )
+        return (
+            self.size >= 2 * len(MAGIC) + FOOTER.size
+            and self._read(self.size - len(MAGIC), len(MAGIC)) == MAGIC
+        )
+
+    def _read_summary(self) -> Summary | None:
+        """The summary where the file has one that leads to every chunk; else None."""
+        at = self.size - len(MAGIC) - FOOTER.size
+        opcode, _, start, _, crc = FOOTER.unpack(self._read(at, FOOTER.size))
+        if opcode != Opcode.FOOTER or start > at:
+            raise self._corrupt(at, "should be the footer and is not")
+        if start == 0:
+            return None
+        if crc and zlib.crc32(self._read(start, at + FOOTER.size - 4 - start)) != crc:
+            raise self._corrupt(start, "(the summary) fails its CRC")
+        try:
+            self._stream.seek(0)
+            summary = make_reader(self._stream).get_summary()
+        except (McapError, struct.error, ValueError) as error:
+            raise self._corrupt(start, f"(the summary) cannot be read ({error})") from error
+        if summary is None or summary.statistics is None or not summary.chunk_indexes:
+            return None
+        if summary.statistics.chunk_count != len(summary.chunk_indexes):
+            return None
+        counted = summary.statistics.channel_message_counts
+        if not all(channel in summary.channels for channel in counted):
+            return None
+        if sum(counted.values()) != summary.statistics.message_count:
+            return None
+        return summary
+
+    def _count_topics(self) -> tuple[Topic, ...]:
+        counts: Counter[int] = Counter()
+        if self._summary is not None and self._summary.statistics is not None:
+            for schema in self._summary.schemas.values():
+                self._schemas[schema.id] = schema.name
+            for channel in self._summary.channels.values():
+                self._learn_channel(channel)
+            counts.update(self._summary.statistics.channel_message_counts)
+        else:
+            for record, content in self._contents(None):
+                for opcode, start, stop in self._inner_records(record, content):
+                    if opcode == Opcode.MESSAGE:
+                        counts[int.from_bytes(content[start : start + 2], "little")] += 1
+                    else:
+                        self._learn(opcode, content[start:stop])
+        messages: Counter[tuple[str, str, str]] = Counter()
+        for channel_id, named in self._channels.items():
+            messages[named] += counts[channel_id]
+        return tuple(Topic(*named, count) for named, count in sorted(messages.items()))
+
+    def _contents(self, wanted: set[str] | None) -> Iterator[tuple[int, bytes]]:
+        """Offset and unpacked content of each chunk (or message outside of chunks)."""
+        if self._summary is None or wanted is None:
+            yield from self._walk()
+            return
+        channels = {number for number, named in self._channels.items() if named[0] in wanted}
+        for index in sorted(self._summary.chunk_indexes, key=lambda c: c.chunk_start_offset):
+            held = index.message_index_offsets
+            if not held or not channels.isdisjoint(held):
+                yield index.chunk_start_offset, self.unpack(index.chunk_start_offset)
+
+    def _walk(self) -> Iterator[tuple[int, bytes]]:
+        """As `_contents`, record by record from the beginning; ends where a cut file does."""
+        at, crc = len(MAGIC), zlib.crc32(MAGIC)
+        try:
+            while True:
+                opcode, content = self._record(at)
+                if opcode == Opcode.DATA_END:
+                    self._check_data_crc(at, content, crc)
+                    break
+                crc = zlib.crc32(content, crc)
+                if opcode in (Opcode.CHUNK, Opcode.MESSAGE):
+                    yield at, self._unpacked(at, opcode, content)
+                else:
+                    self._learn(opcode, content[RECORD_HEAD.size :])
+                at += len(content)
+        except CorruptSourceError:
+            if self.whole:
+                raise
+        if not self.whole:
+            self.lost = f"cut short: whole up to byte {at} of {self.size}, nothing read after it"
+
+    def _check_data_crc(self, at: int, content: bytes, crc: int) -> None:
+        recorded = int.from_bytes(content[RECORD_HEAD.size : RECORD_HEAD.size + 4], "little")
+        if recorded not in (0, crc):
+            raise self._corrupt(at, f"(end of data) gives CRC {recorded:#x}, the data {crc:#x}")
+
+    def _record(self, at: int) -> tuple[int, bytes]:
+        """Opcode and bytes, head included, of the record at an offset."""
+        head = self._read(at, RECORD_HEAD.size)
+        if len(head) < RECORD_HEAD.size:
+            raise self._corrupt(at, "is cut short")
+        opcode, length = RECORD_HEAD.unpack(head)
+        if opcode == 0 or at + RECORD_HEAD.size + length > self.size:
+            raise self._corrupt(at, f"(opcode {opcode}) claims {length} bytes, more than there are")
+        content = head + self._read(at + RECORD_HEAD.size, length)
+        if len(content) < RECORD_HEAD.size + length:
+            raise self._corrupt(at, "is cut short")
+        return opcode, content
+
+    def _unpacked(self, at: int, opcode: int, content: bytes) -> bytes:
+        if opcode == Opcode.MESSAGE:
+            return content
+        if opcode != Opcode.CHUNK:
+            raise self._corrupt(at, f"should be a chunk and is of opcode {opcode}")
+        try:
+            chunk = Chunk.read(ReadDataStream(io.BytesIO(content[RECORD_HEAD.size :])))
+            if chunk.uncompressed_size > LARGEST_CHUNK:
+                raise self._corrupt(at, f"claims to unpack to {chunk.uncompressed_size} bytes")
+            stream, length = get_chunk_data_stream(chunk, validate_crc=True)
+            data = stream.read(length)
+        except CRCValidationError as error:
+            raise self._corrupt(
+                at, f"fails its CRC (recorded {error.expected:#x}, found {error.actual:#x})"
+            ) from error
+        except CorruptSourceError:
+            raise
+        except Exception as error:  # each compression library raises its own
+            raise self._corrupt(at, f"does not unpack, so its CRC cannot hold ({error})") from error
+        if len(data) != chunk.uncompressed_size:
+            raise self._corrupt(at, f"unpacks to {len(data)} bytes, not {chunk.uncompressed_size}")
+        return data
+
+    def _inner_records(self, record: int, content: bytes) -> Iterator[tuple[int, int, int]]:
+        """Opcode, start and stop of the content of each record inside an unpacked chunk."""
+        at = 0
+        while at < len(content):
+            if at + RECORD_HEAD.size > len(content):
+                raise self._corrupt(record, "ends inside a record")
+            opcode, length = RECORD_HEAD.unpack_from(content, at)
+            start, at = at + RECORD_HEAD.size, at + RECORD_HEAD.size + length
+            if at > len(content):
+                raise self._corrupt(record, "ends inside a record")
+            yield opcode, start, at
+
+    def _learn(self, opcode: int, content: bytes) -> None:
+        if opcode == Opcode.SCHEMA:
+            schema = Schema.read(ReadDataStream(io.BytesIO(content)))
+            self._schemas[schema.id] = schema.name
+        elif opcode == Opcode.CHANNEL:
+            self._learn_channel(Channel.read(ReadDataStream(io.BytesIO(content))))
+
+    def _learn_channel(self, channel: Channel) -> None:
+        named = self._schemas.get(channel.schema_id, "").replace("/msg/", "/")
+        self._channels[channel.id] = (channel.topic, named, channel.message_encoding)
+
+    def _read(self, at: int, length: int) -> bytes:
+        self._stream.seek(at)
+        return self._stream.read(length)
+
+    def _corrupt(self, at: int, what: str) -> CorruptSourceError:
+        return CorruptSourceError(f"{self.path}: record at byte {at} {what}; copy the file anew")

@@ -1,0 +1,248 @@
+"""ROS 2 messages as bytes (CDR) and back to numbers: clouds and poses.
+
+Only the five types that carry scans and poses, whose layout ROS fixes; so a log's own schema
+texts (or IDL, or none) do not matter.
+"""
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tilestream.errors import CorruptSourceError
+from tilestream.records import Float64
+
+POINT_CLOUD = "sensor_msgs/PointCloud2"
+ODOMETRY = "nav_msgs/Odometry"
+POSE = "geometry_msgs/PoseStamped"
+POSE_COVARIANCE = "geometry_msgs/PoseWithCovarianceStamped"
+TF = "tf2_msgs/TFMessage"
+
+POINT_FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""sensor_msgs/PointField's datatype -> NumPy type, byte order aside."""
+
+INTENSITY_FIELDS = ("intensity",)
+RING_FIELDS = ("ring", "channel")
+TIME_FIELDS = ("time", "t", "timestamp", "offset_time", "time_stamp")
+LONGEST_SCAN_S = 2.0
+
+
+class Cdr:
+    """The fields of a CDR message, taken one after the other (OMG CDR, version 1)."""
+
+    def __init__(self, data: memoryview) -> None:
+        if len(data) < 4 or data[0] != 0 or data[1] > 1:
+            raise CorruptSourceError("not a CDR message of version 1")
+        self.order = "<" if data[1] else ">"
+        self.data = data
+        self.at = 4
+
+    def take(self, kind: str, count: int = 1) -> tuple[float, ...]:
+        """`count` numbers of one `struct` code, aligned to their size."""
+        self.at += -(self.at - 4) % struct.calcsize("=" + kind)
+        code = f"{self.order}{count}{kind}"
+        values = struct.unpack_from(code, self.data, self.at)
+        self.at += struct.calcsize(code)
+        return values
+
+    def integer(self, kind: str = "I") -> int:
+        """One integer."""
+        return int(self.take(kind)[0])
+
+    def text(self) -> str:
+        """One string, its closing NUL taken off."""
+        length = self.integer()
+        return bytes(self.bytes(length)).rstrip(b"\0").decode("utf-8", errors="replace")
+
+    def bytes(self, length: int) -> memoryview:
+        """The next bytes as they are."""
+        if self.at + length > len(self.data):
+            raise struct.error(f"{length} bytes claimed, {len(self.data) - self.at} left")
+        self.at += length
+        return self.data[self.at - length : self.at]
+
+    def header(self) -> tuple[int, str]:
+        """std_msgs/Header: stamp [ns] and frame, a leading slash taken off."""
+        seconds = self.integer("i")
+        nanoseconds = self.integer()
+        return seconds * 1_000_000_000 + nanoseconds, self.text().lstrip("/")
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A pose at a time: where the frame `child` is in the frame `parent`."""
+
+    stamp_ns: int
+    """Time [ns since the epoch]."""
+    parent: str
+    """Frame in which the pose is given."""
+    child: str
+    """Frame whose pose it is; empty where the message type does not tell."""
+    numbers: tuple[float, ...]
+    """x, y, z [m], qx, qy, qz, qw."""
+
+
+def read_poses(message_type: str, data: memoryview) -> list[Pose]:
+    """The poses in a message of one of the four types that carry them.
+
+    Raises:
+        CorruptSourceError: the message is shorter than its type.
+    """
+    try:
+        cdr = Cdr(data)
+        if message_type == TF:
+            return [_transform(cdr) for _ in range(cdr.integer())]
+        stamp, parent = cdr.header()
+        child = cdr.text().lstrip("/") if message_type == ODOMETRY else ""
+        return [Pose(stamp, parent, child, cdr.take("d", 7))]
+    except struct.error as error:
+        raise CorruptSourceError(f"a {message_type} that is too short ({error})") from error
+
+
+def _transform(cdr: Cdr) -> Pose:
+    stamp, parent = cdr.header()
+    return Pose(stamp, parent, cdr.text().lstrip("/"), cdr.take("d", 7))
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """A sensor_msgs/PointCloud2, its points still packed."""
+
+    stamp_ns: int
+    """Time of the header [ns since the epoch]."""
+    frame: str
+    """Frame of the points."""
+    height: int
+    """Rows; 1 for a cloud that is not organised."""
+    width: int
+    """Points per row."""
+    fields: tuple[tuple[str, str], ...]
+    """Name and NumPy type of each field."""
+    dtype: np.dtype[np.void]
+    """One point."""
+    row_step: int
+    """Bytes from row to row."""
+    data: memoryview
+    """The packed points."""
+
+    @property
+    def points(self) -> int:
+        """Number of points, finite or not."""
+        return self.height * self.width
+
+    def rows(self) -> NDArray[np.void]:
+        """(height * width,) points as a structured array."""
+        strides = (self.row_step, self.dtype.itemsize)
+        shape = (self.height, self.width)
+        return np.ndarray(shape, self.dtype, buffer=self.data, strides=strides).reshape(-1)
+
+    def field(self, names: Sequence[str]) -> str | None:
+        """The first of some names that the cloud has."""
+        return next((name for name in names if name in (self.dtype.names or ())), None)
+
+
+def read_cloud(data: memoryview) -> Cloud:
+    """The layout of a cloud, checked against its bytes; the points stay packed.
+
+    Raises:
+        CorruptSourceError: x, y or z is missing or not a float, a field has an unknown type or
+            lies outside of the point, or the data is shorter than height, width and steps say.
+    """
+    try:
+        cdr = Cdr(data)
+        stamp, frame = cdr.header()
+        height, width = cdr.integer(), cdr.integer()
+        fields = [
+            (cdr.text(), cdr.integer(), cdr.integer("B"), cdr.integer())
+            for _ in range(cdr.integer())
+        ]
+        order = ">" if cdr.integer("B") else "<"
+        point_step, row_step = cdr.integer(), cdr.integer()
+        packed = cdr.bytes(cdr.integer())
+    except struct.error as error:
+        raise CorruptSourceError(f"a {POINT_CLOUD} that is too short ({error})") from error
+    dtype = _point_type(fields, order, point_step)
+    if height <= 1:
+        row_step = width * point_step
+    elif row_step < width * point_step:
+        raise CorruptSourceError(
+            f"row_step is {row_step}, but {width} points of {point_step} bytes need more"
+        )
+    needed = max(height - 1, 0) * row_step + width * point_step
+    if len(packed) < needed and height * width:
+        raise CorruptSourceError(
+            f"data has {len(packed)} bytes, but {height} x {width} points of {point_step} bytes "
+            f"need {needed}"
+        )
+    kinds = tuple((name, np.dtype(POINT_FIELD_TYPES[kind]).name) for name, _, kind, _ in fields)
+    return Cloud(stamp, frame, height, width, kinds, dtype, row_step, packed)
+
+
+def _point_type(
+    fields: list[tuple[str, int, int, int]], order: str, point_step: int
+) -> np.dtype[np.void]:
+    formats, offsets = {}, {}
+    for name, offset, kind, count in fields:
+        if kind not in POINT_FIELD_TYPES:
+            raise CorruptSourceError(f"field {name!r} has the unknown datatype {kind}")
+        if offset + np.dtype(POINT_FIELD_TYPES[kind]).itemsize * max(count, 1) > point_step:
+            raise CorruptSourceError(
+                f"field {name!r} lies outside of its point ({point_step} bytes)"
+            )
+        formats[name] = order + POINT_FIELD_TYPES[kind]
+        offsets[name] = offset
+    for name in ("x", "y", "z"):
+        if formats.get(name, "")[1:] not in ("f4", "f8"):
+            found = ", ".join(formats) or "none"
+            raise CorruptSourceError(f"no field {name!r} of type float32 or float64 (has: {found})")
+    return np.dtype(
+        {
+            "names": list(formats),
+            "formats": list(formats.values()),
+            "offsets": list(offsets.values()),
+            "itemsize": point_step,
+        }
+    )
+
+
+def positions(rows: NDArray[np.void]) -> Float64:
+    """(n, 3) x, y, z of packed points [m]."""
+    points = np.empty((len(rows), 3))
+    for axis, name in enumerate("xyz"):
+        points[:, axis] = rows[name]
+    return points
+
+
+def returned(points: Float64) -> NDArray[np.bool_]:
+    """(n,) which points (n, 3) are true returns: finite, and not at the lidar's own origin, where
+    several drivers put the pulses that never came back.
+    """
+    sums = points[:, 0] + points[:, 1] + points[:, 2]
+    keep: NDArray[np.bool_] = np.isfinite(sums)
+    maybe_origin = np.flatnonzero(sums == 0.0)
+    keep[maybe_origin] = points[maybe_origin].any(axis=1)
+    return keep
+
+
+def time_offsets(values: NDArray[np.generic], stamp_ns: int) -> Float64 | None:
+    """Per-point times relative to the header [s], from a field as a driver wrote it.
+
+    The rule: the first reading that puts every point within 2 s of the header stamp. Relative to
+    the stamp: integers in ns (Ouster, Livox, Autoware), floats in s (Velodyne). Then since the
+    epoch: s (Hesai, Robosense), ms, us, ns (Livox).
+
+    Returns:
+        (n,) seconds; None where all are 0 (a driver that does not fill the field), some are not
+        finite, or no reading fits (another clock or unit).
+    """
+    if not len(values) or not values.any() or not np.isfinite(values).all():
+        return None
+    integers = np.issubdtype(values.dtype, np.integer)
+    since_stamp = values.astype(np.float64) / (1e9 if integers else 1.0)
+    readings = [since_stamp]
+    readings += [values.astype(np.float64) / unit - stamp_ns / 1e9 for unit in (1.0, 1e3, 1e6)]
+    readings += [(values.astype(np.int64) - stamp_ns) / 1e9] if integers else []
+    readings += [values.astype(np.float64) / 1e9 - stamp_ns / 1e9]
+    return next((r for r in readings if np.abs(r).max() < LONGEST_SCAN_S), None)
