@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -167,3 +168,27 @@ def _whole(values: ArrayLike, name: str) -> Int64:
     if given.dtype.kind == "f" and not (np.isfinite(given) & (given == np.rint(given))).all():
         raise UsageError(f"Cells: {name} has values that are no whole numbers")
     return np.array(given, np.int64, order="C")
+
+
+Criterion = Literal["FS", "RQ", "LY", "LS"]
+"""Feature sufficiency, representation quality, layout, local similarity (the paper, section V)."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of a table, documented once: docs, checks and reports are made from this."""
+
+    name: str
+    """Its name in every table."""
+    criterion: Criterion
+    """What it belongs to."""
+    unit: str
+    """Unit of its values: `m`, `bit`, `1` for a plain number, …"""
+    meaning: str
+    """What it says, in a sentence or two."""
+    source: str
+    """The formula, and where it comes from: `eq. 4`, `definitions, section 4`, …"""
+    factor_set: Literal["faithful", "robust"] = "faithful"
+    """The paper's own, or a twin that is not degenerate (definitions, sections 3 and 4)."""
+    dtype: str = "float64"
+    """Type of its values."""
