@@ -1,14 +1,33 @@
 """Files of points, whatever their format: one protocol (base.py) and the registry below."""
 
 import glob
+import inspect
 import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from tilestream.errors import CorruptSourceError, SourceNotFoundError, UnknownFormatError
+from tilestream.errors import (
+    CorruptSourceError,
+    SourceNotFoundError,
+    UnknownFormatError,
+    UsageError,
+)
+from tilestream.formats.autoware import is_map_directory, open_map_directory
 from tilestream.formats.base import Block, PointSource, SourceInfo, Span
+from tilestream.formats.las import MAGIC as LAS_MAGIC
+from tilestream.formats.las import open_las
+from tilestream.formats.mcap import open_drive
 from tilestream.formats.pcd import looks_like_pcd, open_pcd
+from tilestream.formats.ply import MAGIC as PLY_MAGIC
+from tilestream.formats.ply import looks_like_ply, open_ply
+
+try:
+    from tilestream.formats import e57
+except ModuleNotFoundError as missing:
+    if missing.name != "pye57":
+        raise
+    e57 = None  # type: ignore[assignment]  # the extra is not installed
 
 __all__ = [
     "FORMATS",
@@ -46,14 +65,59 @@ class Format:
         return f"{self.name} ({', '.join(self.endings)}): {self.what}"
 
 
+def _begins_with(magic: bytes) -> Callable[[bytes], bool]:
+    return lambda head: head.startswith(magic)
+
+
+def _open_e57(path: str) -> PointSource:
+    if e57 is None:
+        raise UnknownFormatError(f"{path}: E57 needs an extra: pip install 'tilestream[e57]'")
+    return e57.open_e57(path)
+
+
+_E57_MAGIC = b"ASTM-E57"
+_MCAP_MAGIC = b"\x89MCAP0\r\n"
+
 FORMATS = (
     Format(
-        "PCD",
-        (".pcd",),
-        "ascii, binary, binary_compressed",
-        b"# .PCD",
-        looks_like_pcd,
-        open_pcd,
+        name="PCD",
+        endings=(".pcd",),
+        what="ascii, binary, binary_compressed",
+        magic=b"# .PCD",
+        looks_like=looks_like_pcd,
+        open=open_pcd,
+    ),
+    Format(
+        name="LAS",
+        endings=(".las", ".laz"),
+        what="1.0 to 1.4, LAZ and COPC, with CRS",
+        magic=LAS_MAGIC,
+        looks_like=_begins_with(LAS_MAGIC),
+        open=open_las,
+    ),
+    Format(
+        name="PLY",
+        endings=(".ply",),
+        what="ascii, binary of either byte order",
+        magic=PLY_MAGIC,
+        looks_like=looks_like_ply,
+        open=open_ply,
+    ),
+    Format(
+        name="E57",
+        endings=(".e57",),
+        what="cartesian or spherical scans with their poses (extra `e57`)",
+        magic=_E57_MAGIC,
+        looks_like=_begins_with(_E57_MAGIC),
+        open=_open_e57,
+    ),
+    Format(
+        name="MCAP",
+        endings=(".mcap",),
+        what="logs with point clouds and poses: the map that the drive saw",
+        magic=_MCAP_MAGIC,
+        looks_like=_begins_with(_MCAP_MAGIC),
+        open=open_drive,
     ),
 )
 """What `open_source` reads, besides a directory of Autoware's divided map."""
@@ -63,20 +127,27 @@ def open_source(path: str | os.PathLike[str], **options: object) -> PointSource:
     """A file of points, by its ending (in any case) and checked against its first bytes.
 
     Args:
-        path: a file of one of `FORMATS`.
+        path: a file of one of `FORMATS`, or a directory of Autoware's divided map.
         options: what the format takes, e.g. the topics of a log.
 
     Raises:
         SourceNotFoundError: there is no such file.
         UnknownFormatError: the ending is of no supported format, or the content is of another one.
         CorruptSourceError: the file is empty, cut short or damaged.
+        UsageError: an option that the format does not take.
     """
     name = os.fspath(path)
+    if Path(name).is_dir():
+        return open_map_directory(name)
     if not Path(name).is_file():
         raise SourceNotFoundError(f"{name}: no such file; check the path")
     with Path(name).open("rb") as file:
         head = file.read(_HEAD)
-    return _format_of(name, head).open(name, **options)
+    found = _format_of(name, head)
+    unknown = options.keys() - inspect.signature(found.open).parameters.keys()
+    if unknown:
+        raise UsageError(f"{name}: {found.name} takes no option {', '.join(sorted(unknown))}")
+    return found.open(name, **options)
 
 
 def _format_of(path: str, head: bytes) -> Format:
@@ -133,11 +204,16 @@ def expand_sources(
 
 def _expand(pattern: str) -> list[str]:
     if Path(pattern).exists():
-        return [pattern]
-    if not glob.has_magic(pattern):
+        matches = [pattern]
+    elif glob.has_magic(pattern):
+        named = sorted(glob.glob(pattern, recursive=True))  # noqa: PTH207  Path's is relative only
+        matches = [path for path in named if Path(path).is_file() or is_map_directory(Path(path))]
+    else:
         raise SourceNotFoundError(f"{pattern}: no such file or directory; check the path")
-    named = glob.glob(pattern, recursive=True)  # noqa: PTH207  Path.glob takes no absolute pattern
-    matches = sorted(path for path in named if Path(path).is_file())
     if not matches:
         raise SourceNotFoundError(f"{pattern}: the pattern matches no file; check the path")
-    return matches
+    return [file for path in matches for file in _files_of(path)]
+
+
+def _files_of(path: str) -> list[str]:
+    return list(open_map_directory(path).files) if Path(path).is_dir() else [path]

@@ -12,12 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from tilestream.errors import CorruptSourceError, UsageError
 from tilestream.formats.base import Block, SourceInfo, Span
+from tilestream.formats.projector import crs_beside
 from tilestream.formats.rows import (
     BinaryRows,
     Column,
     Columns,
     TextRows,
     as_points,
+    as_text,
     even_spans,
     finite_block,
     steps,
@@ -70,6 +72,8 @@ class PcdSource:
     """Size of the compressed points of binary_compressed [bytes]; else 0."""
     unpacked_bytes: int = 0
     """Size of the decoded points of binary_compressed [bytes]; else 0."""
+    crs: str | None = None
+    """CRS of x and y where an Autoware map's `map_projector_info.yaml` beside the file tells it."""
     notes: tuple[str, ...] = ()
     """What else a user should know."""
 
@@ -82,7 +86,7 @@ class PcdSource:
             points=self.rows.count,
             bounds=None,
             fields=self.fields,
-            crs=None,
+            crs=self.crs,
             resident_bytes=self.packed_bytes + self.unpacked_bytes,
             notes=self.notes,
         )
@@ -154,8 +158,10 @@ def open_pcd(path: str) -> PcdSource:
     if encoding != "binary_compressed":
         rows.check_size(size_bytes)
     left = size_bytes - end if encoding != "ascii" else 0
-    notes = (f"{left} bytes behind the last point are ignored",) if left > 0 else ()
-    return PcdSource(path, encoding, layout.fields, rows, size_bytes, packed, unpacked, notes)
+    crs, notes = crs_beside(Path(path))
+    if left > 0:
+        notes += (f"{left} bytes behind the last point are ignored",)
+    return PcdSource(path, encoding, layout.fields, rows, size_bytes, packed, unpacked, crs, notes)
 
 
 def _read_header(file: BinaryIO, path: str) -> tuple[dict[str, list[str]], int]:
@@ -328,7 +334,7 @@ def write_pcd(
     """
     table = table_of(as_points(points), fields)
     if encoding == "ascii":
-        data = _as_text(table)
+        data = as_text(table)
     elif encoding == "binary":
         data = table.tobytes()
     elif encoding == "binary_compressed":
@@ -357,12 +363,6 @@ def _header_of(table: NDArray[Any], encoding: str) -> bytes:
         f"DATA {encoding}",
     )
     return "".join(f"{line}\n" for line in lines).encode()
-
-
-def _as_text(table: NDArray[Any]) -> bytes:
-    """A line per point; every number in the fewest digits that read back the same."""
-    columns = [table[name].astype(str) for name in table.dtype.names or ()]
-    return "".join(f"{' '.join(row)}\n" for row in zip(*columns, strict=True)).encode()
 
 
 def _packed(raw: bytes) -> bytes:

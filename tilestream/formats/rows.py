@@ -61,16 +61,33 @@ def whole_span(span: Span, count: int, path: str) -> None:
         raise UsageError(f"{path}: {span} is not inside its {count} points")
 
 
-def finite_block(x: NDArray[Any], y: NDArray[Any], z: NDArray[Any]) -> Block:
-    """The points of three columns of numbers, without those that are NaN or infinite."""
+@dataclass(frozen=True)
+class Scaling:
+    """Coordinates as stored to metres: stored x scale + offset, each axis by itself."""
+
+    scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Metres per stored unit."""
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where the stored origin lies [m]."""
+
+
+METRES = Scaling()
+"""Coordinates stored in metres."""
+
+
+def finite_block(
+    x: NDArray[Any], y: NDArray[Any], z: NDArray[Any], scaling: Scaling = METRES
+) -> Block:
+    """The points of three columns of stored numbers, without those that are NaN or infinite."""
     points = np.empty((len(x), 3))
-    kept = finite_points(_native(x), _native(y), _native(z), points)
+    scale, offset = np.array(scaling.scale), np.array(scaling.offset)
+    kept = finite_points(_native(x), _native(y), _native(z), scale, offset, points)
     return Block(points[:kept], dropped=len(x) - kept)
 
 
 def _native(column: NDArray[Any]) -> NDArray[Any]:
-    """The column as the kernel takes it: float32 or float64 in this machine's byte order."""
-    if column.dtype in (np.float32, np.float64) and column.dtype.isnative:
+    """The column in a type that the kernel is compiled for, in this machine's byte order."""
+    if column.dtype in (np.float32, np.float64, np.int32) and column.dtype.isnative:
         return column
     return column.astype(np.float64)
 
@@ -89,6 +106,8 @@ class BinaryRows:
     """Number of rows that the header claims."""
     columns: Columns
     """Where x, y and z lie in a row."""
+    scaling: Scaling = METRES
+    """How the stored numbers become metres."""
 
     def check_size(self, file_bytes: int) -> None:
         """Refuse a file that is too short for the rows that it claims."""
@@ -109,7 +128,8 @@ class BinaryRows:
             for step in steps(span, block_points):
                 n = step.stop - step.start
                 self._fill(file, room[: n * self.size], self.offset + step.start * self.size)
-                yield finite_block(*(self._view(room, n, column) for column in self.columns))
+                x, y, z = (self._view(room, n, column) for column in self.columns)
+                yield finite_block(x, y, z, self.scaling)
 
     def _view(self, room: NDArray[np.uint8], n: int, column: Column) -> NDArray[Any]:
         return np.ndarray((n,), column.dtype, room.data, column.offset, (self.size,))
@@ -171,7 +191,8 @@ class TextRows:
                 rows = list(islice(lines, step.stop - step.start))
                 self._check_rows(rows, step)
                 table = self._numbers(rows, step)
-                yield finite_block(*(table[:, column.offset] for column in self.columns))
+                x, y, z = (table[:, column.offset] for column in self.columns)
+                yield finite_block(x, y, z)
             if span.stop == self.count and not self.more_follows:
                 self._check_end(next(lines, b""))
 
@@ -246,6 +267,12 @@ def table_of(points: Float64, fields: dict[str, ArrayLike] | None) -> NDArray[An
     for name, values in further.items():
         table[name] = values
     return table
+
+
+def as_text(table: NDArray[Any]) -> bytes:
+    """A line per point; every number in the fewest digits that read back the same."""
+    columns = [table[name].astype(str) for name in table.dtype.names or ()]
+    return "".join(f"{' '.join(row)}\n" for row in zip(*columns, strict=True)).encode()
 
 
 @contextmanager

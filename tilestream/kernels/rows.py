@@ -9,22 +9,32 @@ from numpy.typing import NDArray
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def finite_points(
-    x: NDArray[Any], y: NDArray[Any], z: NDArray[Any], points: NDArray[np.float64]
+    x: NDArray[Any],
+    y: NDArray[Any],
+    z: NDArray[Any],
+    scale: NDArray[np.float64],
+    offset: NDArray[np.float64],
+    points: NDArray[np.float64],
 ) -> int:
-    """Write the finite rows of x, y, z to `points`, in order, and return how many they are.
+    """Write the finite rows of (x, y, z) scale + offset to `points`, in order; return their number.
 
     Args:
-        x: (n,) coordinates [m], any real type and stride; so are `y` and `z`.
-        y: (n,) coordinates [m].
-        z: (n,) coordinates [m].
-        points: (n, 3) float64 [m], overwritten: row i is the i-th row (x, y, z) without NaN or
-            infinity; what is behind the returned number is arbitrary.
+        x: (n,) coordinates as stored, any real type and stride; so are `y` and `z`.
+        y: (n,) coordinates.
+        z: (n,) coordinates.
+        scale: (3,) metres per stored unit, finite.
+        offset: (3,) coordinates of the stored origin [m], finite.
+        points: (n, 3) float64 [m], overwritten: the rows without NaN or infinity; what is behind
+            the returned number of rows is arbitrary.
     """
     kept = 0
     for i in range(x.shape[0]):
-        points[kept, 0] = x[i]
-        points[kept, 1] = y[i]
-        points[kept, 2] = z[i]
+        px = x[i] * scale[0] + offset[0]
+        py = y[i] * scale[1] + offset[1]
+        pz = z[i] * scale[2] + offset[2]
+        points[kept, 0] = px
+        points[kept, 1] = py
+        points[kept, 2] = pz
         # a - a is 0 for every finite a, and NaN for the others; no branch
-        kept += ((x[i] - x[i]) + (y[i] - y[i]) + (z[i] - z[i])) == 0
+        kept += ((px - px) + (py - py) + (pz - pz)) == 0.0
     return kept

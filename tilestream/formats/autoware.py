@@ -1,0 +1,169 @@
+"""Autoware's divided map: a directory of PCD files with `pointcloud_map_metadata.yaml`."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import accumulate
+from pathlib import Path
+from typing import Any
+
+from tilestream.errors import CorruptSourceError, SourceNotFoundError, UnknownFormatError
+from tilestream.formats.base import Block, SourceInfo, Span
+from tilestream.formats.pcd import PcdSource, open_pcd
+from tilestream.formats.projector import METADATA, PROJECTOR, read_projector, read_yaml
+from tilestream.formats.rows import whole_span
+
+_INSIDE = "pointcloud_map.pcd"
+"""The sub-directory into which Autoware puts the PCD files."""
+
+
+@dataclass(frozen=True)
+class MapDirectory:
+    """A divided map: its PCD files one behind the other, in the order of their names."""
+
+    path: str
+    """The directory, as it was named."""
+    resolution: tuple[float, float]
+    """Size of a part in x and y [m]."""
+    files: tuple[str, ...]
+    """The PCD files that the metadata lists, sorted."""
+    corners: tuple[tuple[float, float], ...]
+    """Lowest x, y of the part in each file [m], as the metadata tells it."""
+    crs: str | None
+    """CRS of x and y, where `map_projector_info.yaml` truly tells one."""
+    notes: tuple[str, ...]
+    """What else a user should know: projector, files that are not listed."""
+
+    @cached_property
+    def _parts(self) -> tuple[PcdSource, ...]:
+        return tuple(open_pcd(path) for path in self.files)
+
+    @cached_property
+    def _starts(self) -> tuple[int, ...]:
+        return tuple(accumulate((part.rows.count for part in self._parts), initial=0))
+
+    def info(self) -> SourceInfo:
+        """What the headers of all files tell together."""
+        return SourceInfo(
+            path=self.path,
+            format="autoware divided map",
+            size_bytes=sum(part.size_bytes for part in self._parts),
+            points=self._starts[-1],
+            bounds=None,
+            fields=tuple(dict.fromkeys(field for part in self._parts for field in part.fields)),
+            crs=self.crs,
+            resident_bytes=max((part.info().resident_bytes for part in self._parts), default=0),
+            notes=self.notes,
+        )
+
+    def spans(self, points: int) -> list[Span]:
+        """The spans of each file."""
+        return [
+            Span(start + span.start, start + span.stop)
+            for start, part in zip(self._starts, self._parts, strict=False)
+            for span in part.spans(points)
+        ]
+
+    def blocks(self, span: Span, block_points: int) -> Iterator[Block]:
+        """The points of a span in blocks; see `PointSource.blocks`."""
+        whole_span(span, self._starts[-1], self.path)
+        for start, part in zip(self._starts, self._parts, strict=False):
+            first = max(span.start - start, 0)
+            last = min(span.stop - start, part.rows.count)
+            if first < last:
+                yield from part.blocks(Span(first, last), block_points)
+
+
+def is_map_directory(path: Path) -> bool:
+    """Whether a directory has the metadata of a divided map."""
+    return (path / METADATA).is_file()
+
+
+def open_map_directory(path: str) -> MapDirectory:
+    """A divided map; its metadata is read, and every file that it lists is there.
+
+    Raises:
+        UnknownFormatError: the directory has no metadata.
+        CorruptSourceError: the metadata cannot be read, or names a file outside of the directory.
+        SourceNotFoundError: files that it lists are missing; names them.
+    """
+    folder = Path(path)
+    if not is_map_directory(folder):
+        raise UnknownFormatError(
+            f"{path}: a directory without {METADATA} is no divided map; give its files, e.g. "
+            f"'{path}/*.pcd'"
+        )
+    metadata = folder / METADATA
+    content = read_yaml(metadata)
+    resolution = (
+        _resolution(content.pop("x_resolution", None), "x_resolution", metadata),
+        _resolution(content.pop("y_resolution", None), "y_resolution", metadata),
+    )
+    corners = {
+        _file(folder, name, metadata): _corner(name, corner, metadata)
+        for name, corner in content.items()
+    }
+    _refuse_missing(corners, metadata)
+    projector = folder / PROJECTOR
+    crs, notes = read_projector(projector) if projector.is_file() else (None, ())
+    files = sorted(corners)
+    return MapDirectory(
+        path=path,
+        resolution=resolution,
+        files=tuple(map(str, files)),
+        corners=tuple(corners[file] for file in files),
+        crs=crs,
+        notes=(
+            f"{len(files)} parts of {resolution[0]:g} x {resolution[1]:g} m",
+            *notes,
+            *_unlisted(folder, set(files)),
+        ),
+    )
+
+
+def _resolution(value: Any, name: str, metadata: Path) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < math.inf:
+        raise CorruptSourceError(f"{metadata}: {name} is {value!r}, not a length in metres")
+    return float(value)
+
+
+def _file(folder: Path, name: Any, metadata: Path) -> Path:
+    """Where a listed file is: in the sub-directory if it is there, else beside the metadata."""
+    if not isinstance(name, str) or not name.lower().endswith(".pcd"):
+        raise CorruptSourceError(f"{metadata}: entry {name!r} is no name of a PCD file")
+    inside = folder / _INSIDE / name
+    file = inside if inside.is_file() else folder / name
+    home = folder.resolve()
+    if Path(name).is_absolute() or ".." in Path(name).parts or home not in file.resolve().parents:
+        raise CorruptSourceError(
+            f"{metadata}: entry {name!r} points outside of {folder}; a divided map lists files of "
+            "its own directory only"
+        )
+    return file
+
+
+def _corner(name: Any, corner: Any, metadata: Path) -> tuple[float, float]:
+    match corner:
+        case [int() | float() as x, int() | float() as y] if math.isfinite(x) and math.isfinite(y):
+            return float(x), float(y)
+    raise CorruptSourceError(f"{metadata}: entry {name!r} has {corner!r}, not its corner [x, y]")
+
+
+def _refuse_missing(files: dict[Path, tuple[float, float]], metadata: Path) -> None:
+    missing = sorted(file.name for file in files if not file.is_file())
+    if missing:
+        more = f" and {len(missing) - 5} more" if len(missing) > 5 else ""
+        raise SourceNotFoundError(
+            f"{metadata}: lists {len(missing)} of {len(files)} files that are missing: "
+            f"{', '.join(missing[:5])}{more}; copy them, or take them out of the list"
+        )
+
+
+def _unlisted(folder: Path, listed: set[Path]) -> tuple[str, ...]:
+    found = [*folder.glob("*.pcd"), *(folder / _INSIDE).glob("*.pcd")]
+    names = sorted(file.name for file in found if file.is_file() and file not in listed)
+    if not names:
+        return ()
+    more = ", …" if len(names) > 5 else ""
+    return (f"{len(names)} PCD files are not listed and not read: {', '.join(names[:5])}{more}",)

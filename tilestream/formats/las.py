@@ -1,0 +1,285 @@
+"""LAS and LAZ (also COPC, which reads as LAZ), the formats of surveyors."""
+
+import math
+import os
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import laspy
+import lazrs
+import numpy as np
+from numpy.typing import ArrayLike
+from pyproj import CRS
+from pyproj.exceptions import CRSError
+
+from tilestream.errors import CorruptSourceError, CrsError, UsageError
+from tilestream.formats.base import Block, SourceInfo, Span
+from tilestream.formats.rows import (
+    BinaryRows,
+    Column,
+    Scaling,
+    as_points,
+    even_spans,
+    finite_block,
+    steps,
+    whole_span,
+    writing_whole,
+)
+
+MAGIC = b"LASF"
+"""How every LAS and LAZ file begins."""
+_HEADER = struct.Struct("<4s90xHIIBHI")
+"""Magic, header size, where the points start, number of VLRs, point format, point size, points."""
+_HEADER_1_4 = struct.Struct("<QIQ")
+"""Where the EVLRs start, number of EVLRs, points: from byte 235 of the header of LAS 1.4."""
+_VLR_MIN = 54
+_EVLR = struct.Struct("<2x16sHQ32x")
+_SCALE = 0.001
+"""What the writer rounds coordinates to [m]."""
+_INT32 = np.dtype("<i4")
+_XYZ = (Column(0, _INT32), Column(4, _INT32), Column(8, _INT32))
+"""X, Y and Z begin every point, whatever its format."""
+_ONLY_XYZ = laspy.DecompressionSelection.XY_RETURNS_CHANNEL | laspy.DecompressionSelection.Z
+"""What is decoded of a LAZ point where its format can be decoded in parts (6 to 10)."""
+
+
+@dataclass(frozen=True)
+class LasSource:
+    """A LAS or LAZ file; a coordinate is stored integer x scale + offset, in float64."""
+
+    path: str
+    """The file, as it was named."""
+    rows: BinaryRows
+    """Layout of the points; where they lie in a file that is not compressed."""
+    chunks: tuple[int, ...]
+    """Points of each chunk of a compressed file, which can be read by itself; else empty."""
+    summary: SourceInfo
+    """What the header tells."""
+
+    def info(self) -> SourceInfo:
+        """What the header tells."""
+        return self.summary
+
+    def spans(self, points: int) -> list[Span]:
+        """Any pieces of LAS; whole chunks of LAZ, at least one (the writer chose their size)."""
+        if not self.chunks:
+            return even_spans(self.rows.count, points)
+        spans, start = [], 0
+        for end in np.minimum(np.cumsum(self.chunks), self.rows.count).tolist():
+            if end > start and (end - start >= points or end == self.rows.count):
+                spans.append(Span(start, end))
+                start = end
+        return spans
+
+    def blocks(self, span: Span, block_points: int) -> Iterator[Block]:
+        """The points of a span in blocks; see `PointSource.blocks`."""
+        if not self.chunks:
+            return self.rows.blocks(span, block_points)
+        return self._unpacked_blocks(span, block_points)
+
+    def _unpacked_blocks(self, span: Span, block_points: int) -> Iterator[Block]:
+        whole_span(span, self.rows.count, self.path)
+        if span.start == span.stop:
+            return
+        with Path(self.path).open("rb") as file:
+            with _laspy_errors(self.path, f"point {span.start}"):
+                reader = laspy.LasReader(
+                    file,
+                    laz_backend=laspy.LazBackend.Lazrs,
+                    read_evlrs=False,
+                    decompression_selection=_ONLY_XYZ,
+                )
+                reader.seek(span.start)
+            for step in steps(span, block_points):
+                with _laspy_errors(self.path, f"points {step.start} to {step.stop - 1}"):
+                    record = reader.read_points(step.stop - step.start).array
+                yield finite_block(record["X"], record["Y"], record["Z"], self.rows.scaling)
+
+
+def open_las(path: str) -> LasSource:
+    """A LAS or LAZ file; its header and chunk table are read and checked against its size.
+
+    Raises:
+        CorruptSourceError: the file is too short for what its header claims, or damaged.
+        CrsError: it has a CRS that pyproj cannot read.
+    """
+    with Path(path).open("rb") as file:
+        size_bytes = os.fstat(file.fileno()).st_size
+        points_at, point_bytes, count = _checked_header(file, size_bytes, path)
+        file.seek(0)
+        with _laspy_errors(path, "header"):
+            header = laspy.LasHeader.read_from(file, read_evlrs=True)
+            dimensions = list(header.point_format.dimensions)
+        scaling = _scaling(header, path)
+        rows = BinaryRows(path, points_at, point_bytes, count, _XYZ, scaling)
+        if header.are_points_compressed:
+            chunks = _chunks(file, header, rows, size_bytes)
+        else:
+            chunks = ()
+            rows.check_size(size_bytes)
+    crs, notes = _crs(header, path)
+    lowest, highest = (
+        tuple(np.asarray(edge, float).tolist()) for edge in (header.mins, header.maxs)
+    )
+    summary = SourceInfo(
+        path=path,
+        format=f"{'laz' if header.are_points_compressed else 'las'} {header.version}",
+        size_bytes=size_bytes,
+        points=count,
+        bounds=(lowest, highest) if count else None,
+        fields=tuple((d.name, f"{d.num_bits} bit {d.kind.name}") for d in dimensions),
+        crs=crs,
+        resident_bytes=0,
+        notes=notes,
+    )
+    return LasSource(path, rows, chunks, summary)
+
+
+@contextmanager
+def _laspy_errors(path: str, where: str) -> Iterator[None]:
+    """Whatever laspy and lazrs raise on damaged bytes, a panic of lazrs included, by our name."""
+    try:
+        yield
+    except (KeyboardInterrupt, SystemExit, GeneratorExit, MemoryError):
+        raise
+    except BaseException as error:
+        raise CorruptSourceError(
+            f"{path}: damaged or cut short in its {where}: {error}; copy it again from where it "
+            "came from"
+        ) from error
+
+
+def _checked_header(file: BinaryIO, size_bytes: int, path: str) -> tuple[int, int, int]:
+    """Where the points start, bytes of a point, number of points; all of it within the file."""
+    head = file.read(375)
+    if len(head) < 227:
+        raise CorruptSourceError(
+            f"{path}: ends at offset {len(head)}, within its LAS header of at least 227 bytes"
+        )
+    _, header_bytes, points_at, vlrs, _, point_bytes, count = _HEADER.unpack_from(head)
+    evlrs_at, evlrs = 0, 0
+    if head[25] >= 4 and len(head) == 375:
+        evlrs_at, evlrs, count = _HEADER_1_4.unpack_from(head, 235)
+    if header_bytes + vlrs * _VLR_MIN > points_at or points_at > size_bytes or point_bytes < 20:
+        raise CorruptSourceError(
+            f"{path}: its LAS header claims {vlrs} VLRs behind {header_bytes} bytes and points of "
+            f"{point_bytes} bytes from offset {points_at}, the file ends at {size_bytes}: it is "
+            "cut short or damaged"
+        )
+    for _ in range(evlrs):
+        file.seek(evlrs_at)
+        evlr = file.read(_EVLR.size)
+        evlrs_at += _EVLR.size + (_EVLR.unpack(evlr)[2] if len(evlr) == _EVLR.size else 0)
+        if evlrs_at > size_bytes:
+            raise CorruptSourceError(
+                f"{path}: ends at {size_bytes}, within an extended record up to {evlrs_at}: it is "
+                "cut short or damaged"
+            )
+    return points_at, point_bytes, count
+
+
+def _scaling(header: laspy.LasHeader, path: str) -> Scaling:
+    scale, offset = header.scales.tolist(), header.offsets.tolist()
+    if not all(map(math.isfinite, scale + offset)) or 0.0 in scale:
+        raise CorruptSourceError(
+            f"{path}: scale {scale} and offset {offset} in its LAS header give no coordinates"
+        )
+    return Scaling(tuple(scale), tuple(offset))
+
+
+def _chunks(
+    file: BinaryIO, header: laspy.LasHeader, rows: BinaryRows, size_bytes: int
+) -> tuple[int, ...]:
+    """Points of each chunk; the table's claims are checked before lazrs allocates by them."""
+    file.seek(rows.offset)
+    table_at = int.from_bytes(file.read(8), "little", signed=True)
+    if table_at == -1:  # written to a stream: the offset stands at the end of the file
+        file.seek(size_bytes - 8)
+        table_at = int.from_bytes(file.read(8), "little", signed=True)
+    if not rows.offset + 8 <= table_at <= size_bytes - 8:
+        raise CorruptSourceError(
+            f"{rows.path}: its table of compressed chunks is at offset {table_at}, the file ends "
+            f"at {size_bytes}: it is cut short or damaged"
+        )
+    file.seek(table_at + 4)
+    chunks = int.from_bytes(file.read(4), "little")
+    if chunks * rows.size > table_at - rows.offset - 8 and rows.count:
+        raise CorruptSourceError(
+            f"{rows.path}: claims {chunks} chunks at offset {table_at}, more than the "
+            f"{table_at - rows.offset} bytes before it hold: it is damaged"
+        )
+    if not rows.count:
+        return ()
+    with _laspy_errors(rows.path, f"table of chunks at offset {table_at}"):
+        vlr = lazrs.LazVlr(header.vlrs[header.vlrs.index("LasZipVlr")].record_data)
+        file.seek(rows.offset)
+        table: list[tuple[int, int]] = lazrs.read_chunk_table(file, vlr)
+    points, packed = (sum(column) for column in zip(*table, strict=True)) if table else (0, 0)
+    last = table[-1][0] if table else 0
+    if not points - last < rows.count <= points or rows.offset + 8 + packed > table_at:
+        raise CorruptSourceError(
+            f"{rows.path}: its header claims {rows.count} points, its {chunks} chunks hold "
+            f"{points} in {packed} bytes before offset {table_at}: it is damaged"
+        )
+    return tuple(count for count, _ in table)
+
+
+def _crs(header: laspy.LasHeader, path: str) -> tuple[str | None, tuple[str, ...]]:
+    """An EPSG code where the CRS has one, else its WKT."""
+    try:
+        crs: CRS | None = header.parse_crs()
+    except CRSError as error:
+        raise CrsError(f"{path}: has a CRS that pyproj cannot read: {error}") from error
+    if crs is not None:
+        code = crs.to_epsg(min_confidence=100)
+        return (f"EPSG:{code}" if code else crs.to_wkt()), ()
+    records = [*header.vlrs, *(header.evlrs or ())]
+    if any(record.user_id == "LASF_Projection" for record in records):
+        return None, ("its projection records name no CRS by a code",)
+    return None, ()
+
+
+def write_las(path: str | os.PathLike[str], points: ArrayLike, *, crs: str | None = None) -> None:
+    """Write points as LAS 1.4, rounded to 1 mm; compressed if the path ends with `.laz`.
+
+    Args:
+        path: the file; an existing one is replaced. It takes its name only once it is whole.
+        points: (n, 3) finite coordinates [m], each axis within 4,294 km.
+        crs: any string that pyproj reads.
+
+    Raises:
+        UsageError: points that are not finite or too far from each other.
+        CrsError: a CRS that pyproj cannot read.
+    """
+    table = as_points(points)
+    if not np.isfinite(table).all():
+        raise UsageError(f"{os.fspath(path)}: LAS holds no NaN or infinite coordinates")
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales = np.full(3, _SCALE)
+    header.offsets = (
+        np.round((table.min(axis=0) + table.max(axis=0)) / 2) if len(table) else np.zeros(3)
+    )
+    if np.abs(table - header.offsets).max(initial=0.0) >= np.iinfo(np.int32).max * _SCALE:
+        raise UsageError(f"{os.fspath(path)}: LAS holds 4,294 km in millimetres, no more")
+    if crs is not None:
+        header.add_crs(_read_crs(crs))
+    record = laspy.ScaleAwarePointRecord.zeros(len(table), header=header)
+    record["X"], record["Y"], record["Z"] = np.rint((table - header.offsets) / _SCALE).T
+    with writing_whole(path) as file:
+        packed = Path(path).suffix.lower() == ".laz"
+        backend = laspy.LazBackend.Lazrs if packed else None
+        with laspy.LasWriter(
+            file, header, do_compress=packed, laz_backend=backend, closefd=False
+        ) as writer:
+            writer.write_points(record)
+
+
+def _read_crs(crs: str) -> CRS:
+    try:
+        return CRS.from_user_input(crs)
+    except CRSError as error:
+        raise CrsError(f"pyproj cannot read the CRS {crs!r}: {error}") from error

@@ -1,0 +1,265 @@
+"""PLY, ascii and binary of either byte order: the vertices are the points."""
+
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tilestream.errors import CorruptSourceError, UnknownFormatError, UsageError
+from tilestream.formats.base import Block, SourceInfo, Span
+from tilestream.formats.rows import (
+    BinaryRows,
+    Column,
+    Columns,
+    TextRows,
+    as_points,
+    as_text,
+    even_spans,
+    table_of,
+    writing_whole,
+)
+
+MAGIC = b"ply"
+"""The first line of every PLY file."""
+_HEADER_MAX = 1 << 20
+"""Longest header that is read [bytes]."""
+_TYPES = {
+    name: np.dtype(code)
+    for names, code in (
+        (("char", "int8"), "i1"),
+        (("uchar", "uint8"), "u1"),
+        (("short", "int16"), "i2"),
+        (("ushort", "uint16"), "u2"),
+        (("int", "int32"), "i4"),
+        (("uint", "uint32"), "u4"),
+        (("float", "float32"), "f4"),
+        (("double", "float64"), "f8"),
+    )
+    for name in names
+}
+_WRITTEN = {dtype: name for name, dtype in reversed(_TYPES.items())}
+_ByteOrder = Literal["=", "<", ">"]
+_BYTE_ORDER: dict[str, _ByteOrder] = {
+    "ascii": "=",
+    "binary_little_endian": "<",
+    "binary_big_endian": ">",
+}
+
+Encoding = Literal["ascii", "binary_little_endian", "binary_big_endian"]
+
+
+def looks_like_ply(head: bytes) -> bool:
+    """Whether the first bytes of a file are those of a PLY header."""
+    return re.match(rb"ply\r?\n", head) is not None
+
+
+@dataclass(frozen=True)
+class _Property:
+    name: str
+    dtype: np.dtype[Any]
+    is_list: bool
+
+
+@dataclass(frozen=True)
+class _Element:
+    name: str
+    count: int
+    properties: tuple[_Property, ...]
+
+    @property
+    def row_bytes(self) -> int:
+        """Bytes of a binary row: the least, if it has lists."""
+        return sum(p.dtype.itemsize for p in self.properties)
+
+
+@dataclass(frozen=True)
+class PlySource:
+    """A PLY file; x, y and z may be of any numeric type."""
+
+    path: str
+    """The file, as it was named."""
+    encoding: str
+    """How it is written."""
+    fields: tuple[tuple[str, str], ...]
+    """Name and type of every property of a vertex."""
+    rows: BinaryRows | TextRows
+    """Where the vertices lie."""
+    size_bytes: int
+    """Size of the file [bytes]."""
+    notes: tuple[str, ...] = ()
+    """What else a user should know."""
+
+    def info(self) -> SourceInfo:
+        """What the header tells."""
+        return SourceInfo(
+            path=self.path,
+            format=f"ply {self.encoding}",
+            size_bytes=self.size_bytes,
+            points=self.rows.count,
+            bounds=None,
+            fields=self.fields,
+            crs=None,
+            resident_bytes=0,
+            notes=self.notes,
+        )
+
+    def spans(self, points: int) -> list[Span]:
+        """Any pieces of a binary file; text is read from its beginning: one span."""
+        count = self.rows.count
+        return even_spans(count, max(count, points) if self.encoding == "ascii" else points)
+
+    def blocks(self, span: Span, block_points: int) -> Iterator[Block]:
+        """The points of a span in blocks; see `PointSource.blocks`."""
+        return self.rows.blocks(span, block_points)
+
+
+def open_ply(path: str) -> PlySource:
+    """A PLY file; its header is read and checked against the size of the file.
+
+    Raises:
+        CorruptSourceError: the header is incomplete, contradicts itself, names a type that PLY does
+            not have or no x, y, z; or the file is too short for what it claims.
+        UnknownFormatError: the vertices are not the first element or have lists, which a cloud of
+            points has no use for.
+    """
+    with Path(path).open("rb") as file:
+        encoding, elements, offset = _read_header(file, path)
+        size_bytes = os.fstat(file.fileno()).st_size
+    vertex, *others = elements
+    if vertex.name != "vertex" or any(p.is_list for p in vertex.properties):
+        raise UnknownFormatError(
+            f"{path}: its first element, {vertex.name!r}, is not a vertex of plain numbers; write "
+            "it again with the vertices first and without lists"
+        )
+    order = _BYTE_ORDER[encoding]
+    rows: BinaryRows | TextRows
+    if encoding == "ascii":
+        columns = _columns(vertex, [1] * len(vertex.properties), order, path)
+        more = any(other.count for other in others)
+        rows = TextRows(path, offset, len(vertex.properties), vertex.count, columns, more)
+    else:
+        widths = [p.dtype.itemsize for p in vertex.properties]
+        columns = _columns(vertex, widths, order, path)
+        rows = BinaryRows(path, offset, vertex.row_bytes, vertex.count, columns)
+        _check_others(rows, others, size_bytes)
+    rows.check_size(size_bytes)
+    notes = tuple(f"element {other.name!r} ({other.count} rows) is ignored" for other in others)
+    fields = tuple((p.name, p.dtype.name) for p in vertex.properties)
+    return PlySource(path, encoding, fields, rows, size_bytes, notes)
+
+
+def _read_header(file: BinaryIO, path: str) -> tuple[str, list[_Element], int]:
+    """Encoding, elements, and where the data starts."""
+    encoding, elements, words = "", [], [""]
+    file.readline(_HEADER_MAX)
+    while words != ["end_header"]:
+        at = file.tell()
+        line = file.readline(_HEADER_MAX)
+        if not line.endswith(b"\n") or at > _HEADER_MAX:
+            raise CorruptSourceError(
+                f"{path}: its PLY header has no end_header up to offset {at + len(line)}: the file "
+                "is cut short or damaged; copy it again from where it came from"
+            )
+        words = line.decode("ascii", "replace").split()
+        match words:
+            case ["format", ("ascii" | "binary_little_endian" | "binary_big_endian") as word, _]:
+                encoding = word
+            case ["element", name, count] if re.fullmatch(r"[0-9]{1,18}", count):
+                elements.append(_Element(name, int(count), ()))
+            case ["property", *described] if elements:
+                last = elements.pop()
+                properties = (*last.properties, _property(described, last.name, path))
+                elements.append(_Element(last.name, last.count, properties))
+            case ["end_header"] | ["comment" | "obj_info", *_] | []:
+                pass
+            case _:
+                raise CorruptSourceError(
+                    f"{path}: cannot read {line[:60]!r} at offset {at} in its PLY header"
+                )
+    if not encoding or not elements:
+        missing = "element" if encoding else "format"
+        raise CorruptSourceError(f"{path}: its PLY header has no {missing} line")
+    return encoding, elements, file.tell()
+
+
+def _property(described: list[str], element: str, path: str) -> _Property:
+    match described:
+        case [kind, name] if kind in _TYPES:
+            return _Property(name, _TYPES[kind], is_list=False)
+        case ["list", length, kind, name] if length in _TYPES and kind in _TYPES:
+            return _Property(name, _TYPES[length], is_list=True)
+    raise CorruptSourceError(
+        f"{path}: property {' '.join(described)[:80]!r} of element {element!r} has an unknown "
+        f"type; PLY has {', '.join(_TYPES)}"
+    )
+
+
+def _columns(vertex: _Element, widths: list[int], order: _ByteOrder, path: str) -> Columns:
+    names = [p.name for p in vertex.properties]
+
+    def column(name: str) -> Column:
+        if names.count(name) != 1:
+            raise CorruptSourceError(
+                f"{path}: has {names.count(name)} vertex properties {name!r} among "
+                f"{' '.join(names)}; points need x, y and z"
+            )
+        i = names.index(name)
+        return Column(sum(widths[:i]), vertex.properties[i].dtype.newbyteorder(order))
+
+    return column("x"), column("y"), column("z")
+
+
+def _check_others(rows: BinaryRows, others: list[_Element], size_bytes: int) -> None:
+    """Refuse a file that ends within the elements behind the vertices, as far as sizes tell."""
+    end = rows.offset + rows.size * rows.count
+    for other in others:
+        end += other.count * other.row_bytes
+        if other.count and end > size_bytes:
+            raise CorruptSourceError(
+                f"{rows.path}: its {other.count} rows of element {other.name!r} end at {end} or "
+                f"later, but the file ends at {size_bytes}: it is cut short or its header is wrong"
+            )
+
+
+def write_ply(
+    path: str | os.PathLike[str],
+    points: ArrayLike,
+    *,
+    fields: dict[str, ArrayLike] | None = None,
+    encoding: Encoding = "binary_little_endian",
+) -> None:
+    """Write points as PLY; the file takes its name only once it is whole.
+
+    Args:
+        path: the file; an existing one is replaced.
+        points: (n, 3) coordinates [m]: float32 where that moves none by more than 0.1 mm, else
+            float64.
+        fields: further values per point, (n,) each, written with their own type (PLY has integers
+            of up to 32 bits).
+        encoding: how the points are written.
+
+    Raises:
+        UsageError: shapes or types that do not fit, or an encoding that PLY does not have.
+    """
+    if encoding not in _BYTE_ORDER:
+        raise UsageError(f"encoding {encoding!r}: give one of {', '.join(_BYTE_ORDER)}")
+    table = table_of(as_points(points), fields)
+    names = table.dtype.names or ()
+    types = {name: table.dtype[name].newbyteorder("=") for name in names}
+    for name, dtype in types.items():
+        if dtype not in _WRITTEN:
+            raise UsageError(f"field {name!r}: PLY has no {dtype}; it has {', '.join(_TYPES)}")
+    lines = ["ply", f"format {encoding} 1.0", f"element vertex {len(table)}"]
+    lines += [f"property {_WRITTEN[dtype]} {name}" for name, dtype in types.items()]
+    lines.append("end_header")
+    with writing_whole(path) as file:
+        file.write("".join(f"{line}\n" for line in lines).encode())
+        if encoding == "ascii":
+            file.write(as_text(table))
+        else:
+            file.write(table.astype(table.dtype.newbyteorder(_BYTE_ORDER[encoding])).tobytes())
