@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tilestream.kernels.neighbours import cells_around, neighbours_within
+from tilestream.kernels.near_cells import cells_around, neighbours_within
 from tilestream.kernels.pairs import (
     bhattacharyya_sums,
     entropy_of_counts,
@@ -241,10 +241,9 @@ def test_a_street_has_the_same_terms_as_plain_numpy(shared_data) -> None:
 
 @pytest.mark.skipif("NUMBA_DISABLE_JIT" in os.environ, reason="is itself the run without the JIT")
 def test_the_kernels_say_the_same_without_the_compiler() -> None:
-    chosen = "plain_numpy or fewer_than_three or at_the_radius or identical"
+    chosen = "(plain_numpy or fewer_than_three or at_the_radius or identical) and not street"
     result = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider"]
-        + [__file__, "-k", f"({chosen}) and not street"],  # noqa: RUF005
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-k", chosen, __file__],
         env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
         capture_output=True,
         text=True,
