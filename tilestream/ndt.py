@@ -22,12 +22,14 @@ def to_mm(points: ArrayLike) -> Int64:
         UsageError: another shape, values that are not finite numbers, or farther than 10^9 km out.
     """
     try:
-        metres = np.asarray(points, np.float64)
-    except (TypeError, ValueError):
-        raise UsageError("points are no numbers: give an (n, 3) array of metres") from None
+        metres = np.asarray(points)
+    except ValueError:
+        raise UsageError("points are no array: give an (n, 3) array of metres") from None
+    if metres.dtype.kind not in "iuf":
+        raise UsageError(f"points have type {metres.dtype}: give an (n, 3) array of metres")
     if metres.ndim != 2 or metres.shape[1] != 3:
         raise UsageError(f"points have shape {metres.shape}: give an (n, 3) array of metres")
-    mm: Float64 = np.rint(metres * MM_PER_M)
+    mm: Float64 = np.rint(metres.astype(np.float64) * MM_PER_M)
     if not (np.abs(mm) < EXACT_MM).all():
         row = int(np.flatnonzero(~(np.abs(mm) < EXACT_MM).all(axis=1))[0])
         raise UsageError(f"point {row} is {tuple(metres[row].tolist())}: give finite metres")

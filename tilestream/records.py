@@ -76,10 +76,10 @@ class Cells:
         if whole_mm(self.cell_size, "cell_size") <= 0:
             raise UsageError(f"cell_size is {self.cell_size!r} m: give more than 0")
         index = _whole(self.index, "index")
-        n = len(index)
+        n = index.shape[0] if index.ndim else 0
         count = _whole(self.count, "count")
-        mean = np.array(self.mean, np.float64, order="C")
-        covariance = np.array(self.covariance, np.float64, order="C")
+        mean = _real(self.mean, "mean")
+        covariance = _real(self.covariance, "covariance")
         for name, array, shape in (
             ("index", index, (n, 3)),
             ("count", count, (n,)),
@@ -158,6 +158,14 @@ class Cells:
     def precision(self) -> Float64:
         """(n, 3, 3) inverse of the regularised covariance [1/m^2]."""
         return self._regularised[1]
+
+
+def _real(values: ArrayLike, name: str) -> Float64:
+    """A copy as float64, refusing what are no numbers."""
+    given = np.asarray(values)
+    if given.dtype.kind not in "iuf":
+        raise UsageError(f"Cells: {name} has type {given.dtype}, expected numbers")
+    return np.array(given, np.float64, order="C")
 
 
 def _whole(values: ArrayLike, name: str) -> Int64:
