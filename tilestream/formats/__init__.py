@@ -4,8 +4,10 @@ import glob
 import inspect
 import os
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from tilestream.errors import (
     CorruptSourceError,
@@ -21,6 +23,7 @@ from tilestream.formats.mcap import open_drive
 from tilestream.formats.pcd import looks_like_pcd, open_pcd
 from tilestream.formats.ply import MAGIC as PLY_MAGIC
 from tilestream.formats.ply import looks_like_ply, open_ply
+from tilestream.records import Float64
 
 try:
     from tilestream.formats import e57
@@ -36,12 +39,17 @@ __all__ = [
     "PointSource",
     "SourceInfo",
     "Span",
+    "describe",
     "expand_sources",
     "open_source",
 ]
 
 _HEAD = 4096
 """What is read of a file to see which format it has [bytes]."""
+_READ_MAX = 1_000_000_000
+"""Largest file that `describe` reads for its bounds [bytes]."""
+_BLOCK = 1 << 17
+"""Points that `describe` reads at once: they stay in the cache."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +68,11 @@ class Format:
     """Whether the first bytes of a file are of this format."""
     open: Callable[..., PointSource]
     """A file of it, by its path and the options of the format."""
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """Names of the options that `open` takes."""
+        return tuple(inspect.signature(self.open).parameters)[1:]
 
     def __str__(self) -> str:
         return f"{self.name} ({', '.join(self.endings)}): {self.what}"
@@ -128,13 +141,14 @@ def open_source(path: str | os.PathLike[str], **options: object) -> PointSource:
 
     Args:
         path: a file of one of `FORMATS`, or a directory of Autoware's divided map.
-        options: what the format takes, e.g. the topics of a log.
+        options: what a format takes, e.g. the topics of a log; files of another one ignore it, so
+            that a mixed list can share its options.
 
     Raises:
         SourceNotFoundError: there is no such file.
         UnknownFormatError: the ending is of no supported format, or the content is of another one.
         CorruptSourceError: the file is empty, cut short or damaged.
-        UsageError: an option that the format does not take.
+        UsageError: an option that no format takes.
     """
     name = os.fspath(path)
     if Path(name).is_dir():
@@ -144,10 +158,37 @@ def open_source(path: str | os.PathLike[str], **options: object) -> PointSource:
     with Path(name).open("rb") as file:
         head = file.read(_HEAD)
     found = _format_of(name, head)
-    unknown = options.keys() - inspect.signature(found.open).parameters.keys()
-    if unknown:
-        raise UsageError(f"{name}: {found.name} takes no option {', '.join(sorted(unknown))}")
-    return found.open(name, **options)
+    known = {option for f in FORMATS for option in f.options}
+    if unknown := sorted(options.keys() - known):
+        raise UsageError(f"{name}: no format takes the option {', '.join(unknown)}")
+    return found.open(name, **{o: options[o] for o in found.options if o in options})
+
+
+def describe(path: str | os.PathLike[str], **options: object) -> SourceInfo:
+    """What is in a file, as `PointSource.info`, and its bounds also where no header tells them.
+
+    For those a file of up to 1 GB is read; a note says how many of its points are not finite.
+    Arguments and errors as for `open_source`.
+    """
+    source = open_source(path, **options)
+    found = source.info()
+    if found.bounds is not None or not found.points or found.size_bytes > _READ_MAX:
+        return found
+    lowest, highest, dropped = np.full(3, np.inf), np.full(3, -np.inf), 0
+    for span in source.spans(found.points):
+        for block in source.blocks(span, _BLOCK):
+            lowest = np.minimum(lowest, block.points.min(axis=0, initial=np.inf))
+            highest = np.maximum(highest, block.points.max(axis=0, initial=-np.inf))
+            dropped += block.dropped
+    notes = (*found.notes, f"{dropped} points are not finite") if dropped else found.notes
+    if dropped == found.points:
+        return replace(found, notes=notes)
+    return replace(found, bounds=(_corner(lowest), _corner(highest)), notes=notes)
+
+
+def _corner(corner: Float64) -> tuple[float, float, float]:
+    x, y, z = corner.tolist()
+    return x, y, z
 
 
 def _format_of(path: str, head: bytes) -> Format:
