@@ -48,6 +48,25 @@ class Trajectory:
     """Name of the frame that moves, as recorded."""
 
 
+@dataclass(frozen=True, eq=False)
+class Route:
+    """A path along which a vehicle drives, k >= 2 points of it."""
+
+    route_id: str
+    """Name of the route, unique in its file."""
+    positions: Float64
+    """(k, 3) points on the road [m, map frame]; z is NaN in all where the route has none."""
+    arc_length: Float64
+    """(k,) length along the route from its first point [m], strictly rising from 0; of the route in
+    three dimensions where it has z."""
+    heading: Float64
+    """(k,) direction of travel [rad, from the map's x axis towards y, in (-pi, pi]]."""
+    crs: str | None = None
+    """Coordinate reference system, where the file or the user names it."""
+    dropped: int = 0
+    """Points of the file that repeated the one before them and are not here."""
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Cells:
     """Normal distributions on the map's lattice: the NDT map, or a part of it.
