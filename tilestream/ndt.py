@@ -5,11 +5,13 @@ from numpy.typing import ArrayLike
 
 from tilestream.errors import UsageError
 from tilestream.kernels.cells import EXACT_MM, cell_sums, moments
-from tilestream.records import Cells, Float64, Int64
+from tilestream.kernels.scatter import round_to_mm
+from tilestream.records import Cells, Int64
 from tilestream.tiling import MM_PER_M, whole_mm
 
 MIN_POINTS = 6
 """Fewest map points of a cell."""
+_LIMITS_MM = np.full(3, EXACT_MM - 1.0)
 
 
 def to_mm(points: ArrayLike) -> Int64:
@@ -29,11 +31,12 @@ def to_mm(points: ArrayLike) -> Int64:
         raise UsageError(f"points have type {metres.dtype}: give an (n, 3) array of metres")
     if metres.ndim != 2 or metres.shape[1] != 3:
         raise UsageError(f"points have shape {metres.shape}: give an (n, 3) array of metres")
-    mm: Float64 = np.rint(metres.astype(np.float64) * MM_PER_M)
-    if not (np.abs(mm) < EXACT_MM).all():
-        row = int(np.flatnonzero(~(np.abs(mm) < EXACT_MM).all(axis=1))[0])
+    metres = np.ascontiguousarray(metres, np.float64)
+    mm = np.empty(metres.shape, np.int64)
+    row = round_to_mm(metres, _LIMITS_MM, mm)
+    if row >= 0:
         raise UsageError(f"point {row} is {tuple(metres[row].tolist())}: give finite metres")
-    return mm.astype(np.int64)
+    return mm
 
 
 def cells_of_mm(points_mm: Int64, cell_mm: int, min_points: int = MIN_POINTS) -> Cells:
