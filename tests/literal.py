@@ -181,6 +181,11 @@ def azimuth(vectors: Floats) -> Floats:
     return np.where(flat, 0.0, np.arctan2(vectors[:, 1], vectors[:, 0]))
 
 
+def snapped(x: Floats) -> Floats:
+    """Magnitudes below 1e-9 are 0, as in exact arithmetic: else rounding picks -pi or pi."""
+    return np.where(np.abs(x) < TIE, 0.0, x)
+
+
 def elevation(vectors: Floats) -> Floats:
     """Angle above the horizontal."""
     return np.arcsin(np.clip(vectors[:, 2] / np.linalg.norm(vectors, axis=1), -1.0, 1.0))
@@ -461,7 +466,7 @@ def literal_pfh(cells: LiteralCells, c: int) -> Floats | None:
     w = np.cross(u, v)
     alpha = (v * n_t).sum(axis=1)
     phi = (u * d).sum(axis=1) / length
-    theta = np.arctan2((w * n_t).sum(axis=1), (u * n_t).sum(axis=1))
+    theta = np.arctan2(snapped((w * n_t).sum(axis=1)), snapped((u * n_t).sum(axis=1)))
     box = clipped_bin(alpha, -1.0, 0.4, 5) * 25 + clipped_bin(phi, -1.0, 0.4, 5) * 5
     box += clipped_bin(theta, -np.pi, 2 * np.pi / 5, 5)
     histogram = np.bincount(box, minlength=125)

@@ -166,8 +166,22 @@ def empty_lot(rng: Rng, size: float, spacing: float) -> Floats:
     return np.vstack([lot, *posts])
 
 
+def regular(rng: Rng, size: float, spacing: float) -> Floats:
+    """A street without noise or chance: grids on exact planes, so that every tie rule is met."""
+    steps = np.arange(0.0, size, spacing)
+    across, up = np.arange(-8.0, 8.0, spacing), np.arange(0.0, size / 2, spacing)
+    floor = np.stack(np.meshgrid(steps, across, [0.0]), axis=-1)
+    walls = np.stack(np.meshgrid(steps, [-7.0, 7.0], up), axis=-1)
+    end = np.stack(np.meshgrid([size - 1.0], across, up), axis=-1)
+    slant = np.stack(np.meshgrid(steps[: len(steps) // 3], up), axis=-1).reshape(-1, 2)
+    slanted = np.column_stack([slant[:, 0] + 2.0, slant[:, 0] - 2.0, slant[:, 1]])
+    post = np.stack(np.meshgrid([5.0], [-3.0], np.arange(0.0, 6.0, spacing / 4)), axis=-1)
+    parts = [floor, walls, end, slanted, post]
+    return rng.permutation(np.vstack([part.reshape(-1, 3) for part in parts]))
+
+
 PLACES: dict[str, Callable[[Rng, float, float], Floats]] = {
-    place.__name__: place for place in (canyon, diagonal, crossing, tunnel, park, empty_lot)
+    place.__name__: place for place in (canyon, diagonal, crossing, tunnel, park, empty_lot, regular)
 }
 
 
