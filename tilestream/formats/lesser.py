@@ -79,14 +79,19 @@ def _on_beams(scan: Scan, beams: int, recorded: int | None) -> NDArray[np.bool_]
         return np.isin(scan.ring, chosen)
     elevation = _elevation_deg(scan.points)
     low, high = np.percentile(elevation, [0.5, 99.5])
-    gap = (high - low) / (recorded - 1) if recorded else _beam_gap_deg(scan.points, elevation)
-    _check_enough(beams, round((high - low) / gap) + 1)
+    if recorded:
+        gap = (high - low) / max(recorded - 1, 1)
+    else:
+        gap = _beam_gap_deg(scan.points, elevation)
+        recorded = round((high - low) / gap) + 1
+    _check_enough(beams, recorded)
     if beams == 1:
         low = high = (low + high) / 2
     spacing = (high - low) / max(beams - 1, 1) or 1.0
     nearest = np.clip(np.round((elevation - low) / spacing), 0, beams - 1)
     off_beam = elevation - (low + nearest * spacing)
-    return np.less_equal(np.abs(off_beam), gap / 2)
+    on_beam: NDArray[np.bool_] = np.abs(off_beam) <= gap / 2
+    return on_beam
 
 
 def _check_enough(beams: int, recorded: int) -> None:

@@ -1,0 +1,192 @@
+"""Lanelet2 maps: centre lines of the lanelets that vehicles drive on.
+
+Format: Lanelet2's OSM XML (a lanelet is a relation with the ways `left` and `right`, maybe
+`centerline`); Autoware's maps carry metric `local_x`, `local_y` and `ele` tags on every node.
+"""
+
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass
+
+import numpy as np
+
+from tilestream.errors import CorruptSourceError
+from tilestream.formats.route_files import DEGREES, Path3
+from tilestream.records import Float64
+
+NOT_FOR_VEHICLES = frozenset(
+    {"crosswalk", "walkway", "shared_walkway", "pedestrian_lane", "stairs", "bicycle_lane"}
+)
+"""Subtypes of lanelets that are left out."""
+MIN_SAMPLES = 10
+"""Least number of points on a centre line made from its bounds."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Lanelet:
+    number: str
+    starts_at: tuple[str, str]
+    """First nodes of its left and right bound, in the direction of travel."""
+    ends_at: tuple[str, str]
+    """Last nodes of its left and right bound."""
+    centre: Float64
+    """(n, 3) centre line."""
+
+
+def read_lanelet2(path: str) -> list[Path3]:
+    """Centre lines of the lanelets for vehicles, in the file's order.
+
+    The centre line is the lanelet's own where it has one, else the middle of its bounds, each at
+    the same share of its length. Lanelets are joined to one path (`101-102-105`) as long as exactly
+    one follows and it follows that one only.
+
+    Coordinates are `local_x`, `local_y` and `ele` (z) where every node of the bounds has them, else
+    longitude and latitude in degrees (`Path3.crs` says so), z from `ele` where every node has it.
+
+    Raises:
+        CorruptSourceError: no Lanelet2 map, or a lanelet that lacks a bound or a node (names it).
+    """
+    try:
+        root = ET.parse(path).getroot()
+    except ET.ParseError as error:
+        raise CorruptSourceError(f"{path}: no OSM XML ({error})") from error
+    nodes = {_id(node): node for node in root.iter("node")}
+    ways = {_id(way): [str(nd.get("ref")) for nd in way.iter("nd")] for way in root.iter("way")}
+    relations = [r for r in root.iter("relation") if _for_vehicles(_tags(r))]
+    if not relations:
+        raise CorruptSourceError(f"{path}: holds no lanelets for vehicles")
+    used = {n for r in relations for m in r.iter("member") for n in ways.get(_ref(m), [])}
+    metric, coordinates = _coordinates(path, nodes, used)
+    lanelets = [_lanelet(path, r, ways, coordinates) for r in relations]
+    crs = None if metric else DEGREES
+    return [
+        Path3("-".join(part.number for part in chain), _joined(chain), crs)
+        for chain in _chains(lanelets)
+    ]
+
+
+def _for_vehicles(tags: dict[str, str]) -> bool:
+    return tags.get("type") == "lanelet" and tags.get("subtype") not in NOT_FOR_VEHICLES
+
+
+def _coordinates(
+    path: str, nodes: dict[str, ET.Element], used: set[str]
+) -> tuple[bool, dict[str, Float64]]:
+    """Whether coordinates are metric, and x, y, z of each node used."""
+    missing = sorted(used - nodes.keys())
+    if missing:
+        raise CorruptSourceError(f"{path}: node {missing[0]} is used and not there")
+    tags = {number: _tags(nodes[number]) for number in used}
+    metric = all("local_x" in t and "local_y" in t for t in tags.values())
+    has_z = all("ele" in t for t in tags.values())
+    coordinates = {}
+    for number, t in tags.items():
+        node = nodes[number]
+        x, y = (t["local_x"], t["local_y"]) if metric else (node.get("lon"), node.get("lat"))
+        try:
+            point = [float(x or ""), float(y or ""), float(t["ele"]) if has_z else np.nan]
+        except ValueError as error:
+            raise CorruptSourceError(f"{path}: node {number} has no position ({error})") from error
+        coordinates[number] = np.array(point)
+    return metric, coordinates
+
+
+def _lanelet(
+    path: str, relation: ET.Element, ways: dict[str, list[str]], coordinates: dict[str, Float64]
+) -> _Lanelet:
+    number = _id(relation)
+    roles = {str(m.get("role")): _ref(m) for m in relation.iter("member") if m.get("type") == "way"}
+    bounds = []
+    for role in ("left", "right"):
+        nodes = ways.get(roles.get(role, ""), [])
+        if len(nodes) < 2:
+            raise CorruptSourceError(f"{path}: lanelet {number} has no {role} bound of 2 nodes")
+        bounds.append(nodes)
+    left, right = bounds
+    left_xyz, right_xyz = (np.array([coordinates[n] for n in nodes]) for nodes in bounds)
+    if _against(left_xyz, right_xyz):
+        right, right_xyz = right[::-1], right_xyz[::-1]
+    if not _on_the_left(left_xyz, right_xyz):
+        left, left_xyz, right, right_xyz = left[::-1], left_xyz[::-1], right[::-1], right_xyz[::-1]
+    centre = _middle(left_xyz, right_xyz)
+    own = ways.get(roles.get("centerline", ""), [])
+    if len(own) >= 2:
+        drawn = np.array([coordinates[n] for n in own])
+        centre = drawn[::-1] if _against(centre, drawn) else drawn
+    return _Lanelet(number, (left[0], right[0]), (left[-1], right[-1]), centre)
+
+
+def _against(a: Float64, b: Float64) -> bool:
+    """Whether two lines side by side run in opposite directions."""
+
+    def apart(p: Float64, q: Float64) -> float:
+        return float(np.linalg.norm((p - q)[:2]))
+
+    return apart(a[0], b[-1]) + apart(a[-1], b[0]) < apart(a[0], b[0]) + apart(a[-1], b[-1])
+
+
+def _on_the_left(left: Float64, right: Float64) -> bool:
+    """Whether the area between the bounds is to the right of `left` (traffic runs along it)."""
+    ring = np.concatenate([left, right[::-1]])[:, :2]
+    ring = ring - ring[0]
+    following = np.roll(ring, -1, axis=0)
+    return bool((ring[:, 0] * following[:, 1] - ring[:, 1] * following[:, 0]).sum() <= 0)
+
+
+def _middle(left: Float64, right: Float64) -> Float64:
+    """Middle of two lines, at the same share of their lengths, as often as the finer has points."""
+    count = max(len(left), len(right), MIN_SAMPLES)
+    shares = np.linspace(0.0, 1.0, count)
+    return (_at_share(left, shares) + _at_share(right, shares)) / 2
+
+
+def _at_share(line: Float64, shares: Float64) -> Float64:
+    steps = np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    return np.column_stack([np.interp(shares * along[-1], along, column) for column in line.T])
+
+
+def _chains(lanelets: list[_Lanelet]) -> list[list[_Lanelet]]:
+    starting: dict[tuple[str, str], list[_Lanelet]] = {}
+    ending: dict[tuple[str, str], list[_Lanelet]] = {}
+    for lanelet in lanelets:
+        starting.setdefault(lanelet.starts_at, []).append(lanelet)
+        ending.setdefault(lanelet.ends_at, []).append(lanelet)
+
+    def successor(lanelet: _Lanelet) -> _Lanelet | None:
+        following = starting.get(lanelet.ends_at, [])
+        alone = len(following) == 1 and len(ending[lanelet.ends_at]) == 1
+        return following[0] if alone else None
+
+    followers = {id(s) for lanelet in lanelets if (s := successor(lanelet)) is not None}
+    chains: list[list[_Lanelet]] = []
+    done: set[int] = set()
+    # a ring of lanelets has no first one: it begins at the one the file names first
+    for lanelet in [x for x in lanelets if id(x) not in followers] + lanelets:
+        chain: list[_Lanelet] = []
+        part: _Lanelet | None = lanelet
+        while part is not None and id(part) not in done:
+            done.add(id(part))
+            chain.append(part)
+            part = successor(part)
+        if chain:
+            chains.append(chain)
+    order = {id(lanelet): index for index, lanelet in enumerate(lanelets)}
+    return sorted(chains, key=lambda chain: order[id(chain[0])])
+
+
+def _joined(chain: list[_Lanelet]) -> Float64:
+    """The centre lines one after the other, the shared points once."""
+    first, *rest = chain
+    return np.concatenate([first.centre, *(part.centre[1:] for part in rest)])
+
+
+def _tags(element: ET.Element) -> dict[str, str]:
+    return {str(tag.get("k")): str(tag.get("v")) for tag in element.iter("tag")}
+
+
+def _id(element: ET.Element) -> str:
+    return str(element.get("id"))
+
+
+def _ref(member: ET.Element) -> str:
+    return str(member.get("ref"))
