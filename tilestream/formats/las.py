@@ -1,5 +1,6 @@
 """LAS and LAZ (also COPC, which reads as LAZ), the formats of surveyors."""
 
+import logging
 import math
 import os
 import struct
@@ -29,6 +30,8 @@ from tilestream.formats.rows import (
     whole_span,
     writing_whole,
 )
+
+logging.getLogger("laspy").addHandler(logging.NullHandler())  # its errors are raised as ours
 
 MAGIC = b"LASF"
 """How every LAS and LAZ file begins."""
@@ -195,6 +198,8 @@ def _chunks(
     file: BinaryIO, header: laspy.LasHeader, rows: BinaryRows, size_bytes: int
 ) -> tuple[int, ...]:
     """Points of each chunk; the table's claims are checked before lazrs allocates by them."""
+    if not rows.count:
+        return ()
     file.seek(rows.offset)
     table_at = int.from_bytes(file.read(8), "little", signed=True)
     if table_at == -1:  # written to a stream: the offset stands at the end of the file
@@ -207,20 +212,21 @@ def _chunks(
         )
     file.seek(table_at + 4)
     chunks = int.from_bytes(file.read(4), "little")
-    if chunks * rows.size > table_at - rows.offset - 8 and rows.count:
+    if (chunks - 1) * rows.size > table_at - rows.offset - 8:  # each begins with a whole point
         raise CorruptSourceError(
             f"{rows.path}: claims {chunks} chunks at offset {table_at}, more than the "
             f"{table_at - rows.offset} bytes before it hold: it is damaged"
         )
-    if not rows.count:
-        return ()
     with _laspy_errors(rows.path, f"table of chunks at offset {table_at}"):
         vlr = lazrs.LazVlr(header.vlrs[header.vlrs.index("LasZipVlr")].record_data)
+        if vlr.item_size() != rows.size:
+            raise ValueError(f"its chunks hold points of {vlr.item_size()} bytes, not {rows.size}")
         file.seek(rows.offset)
         table: list[tuple[int, int]] = lazrs.read_chunk_table(file, vlr)
     points, packed = (sum(column) for column in zip(*table, strict=True)) if table else (0, 0)
-    last = table[-1][0] if table else 0
-    if not points - last < rows.count <= points or rows.offset + 8 + packed > table_at:
+    # the last chunk of equal ones may be filled in part, or not at all
+    spare = 0 if vlr.uses_variable_size_chunks() else vlr.chunk_size()
+    if not points - spare <= rows.count <= points or rows.offset + 8 + packed > table_at:
         raise CorruptSourceError(
             f"{rows.path}: its header claims {rows.count} points, its {chunks} chunks hold "
             f"{points} in {packed} bytes before offset {table_at}: it is damaged"
@@ -233,7 +239,10 @@ def _crs(header: laspy.LasHeader, path: str) -> tuple[str | None, tuple[str, ...
     try:
         crs: CRS | None = header.parse_crs()
     except CRSError as error:
-        raise CrsError(f"{path}: has a CRS that pyproj cannot read: {error}") from error
+        raise CrsError(
+            f"{path}: has a CRS that pyproj cannot read: {str(error)[:200]}; write it again with "
+            "another one"
+        ) from error
     if crs is not None:
         code = crs.to_epsg(min_confidence=100)
         return (f"EPSG:{code}" if code else crs.to_wkt()), ()

@@ -211,17 +211,21 @@ class TextRows:
     def _numbers(self, rows: list[bytes], step: Span) -> Float64:
         try:
             table = np.loadtxt(rows, dtype=np.float64, comments=None, ndmin=2)
-        except (ValueError, OverflowError) as error:
+        except (ValueError, OverflowError):
+            table = np.empty((0, 0))
+        if table.shape != (len(rows), self.words):
+            row = next((i for i, row in enumerate(rows) if not self._is_row(row)), 0)
             raise CorruptSourceError(
-                f"{self.path}: points {step.start} to {step.stop - 1} are no table of "
-                f"{self.words} numbers a row, rows counted from point {step.start}: {error}"
-            ) from error
-        if table.shape[1] != self.words:
-            raise CorruptSourceError(
-                f"{self.path}: point {step.start} has {table.shape[1]} numbers, its header says "
-                f"{self.words}"
+                f"{self.path}: point {step.start + row} is {rows[row][:80]!r}, not {self.words} "
+                "numbers: the file is damaged or its header is wrong"
             )
         return table
+
+    def _is_row(self, line: bytes) -> bool:
+        try:
+            return len([float(word) for word in line.split()]) == self.words
+        except ValueError:
+            return False
 
     def _check_end(self, line: bytes) -> None:
         if line:
