@@ -219,3 +219,94 @@ class Column:
     """The paper's own, or a twin that is not degenerate (definitions, sections 3 and 4)."""
     dtype: str = "float64"
     """Type of its values."""
+
+
+@dataclass(frozen=True, eq=False)
+class Registrations:
+    """What registering one scan from k starts gave; a row per start, in the order of the starts."""
+
+    T_map_lidar: Float64
+    """(k, 4, 4) final poses."""
+    converged: NDArray[np.bool_]
+    """(k,) whether the last step was shorter than epsilon; never because the iterations ended."""
+    iterations: Int64
+    """(k,) Newton steps taken."""
+    score: Float64
+    """(k,) sum over scan points and their cells of -d1 p at the final pose, no unit, >= 0."""
+    nvtl: Float64
+    """(k,) mean over all scan points of their best cell's -d1 p, 0 for a point without a cell, no
+    unit."""
+    hits: Int64
+    """(k,) scan points with at least one cell at the final pose."""
+    hessian: Float64
+    """(k, 6, 6) of `score` at the final pose, raw, for steps (tau, w): t + tau [m, map frame],
+    Exp(w) R [rad] about the scan's origin. -hessian^-1 is a covariance where it is definite."""
+    points: int
+    """Number of scan points that were scored, after thinning."""
+
+    def __len__(self) -> int:
+        return len(self.converged)
+
+
+TruePose = Literal["log", "refined"]
+"""Where a true pose is from: the log (or the simulator), or refined with the scan it judges."""
+
+
+@dataclass(frozen=True, eq=False)
+class LocalizationError:
+    """How far registrations end from the true pose: the label of a sample point.
+
+    Errors are final minus true position in the frame of the true heading. A start has failed when
+    its 3D error exceeds 0.5 m, converged or not. The mean of nothing is NaN.
+    """
+
+    T_map_lidar: Float64
+    """(4, 4) the true pose."""
+    true_pose: TruePose
+    """Where the true pose is from; labels of the two kinds are never mixed."""
+    T_map_lidar_starts: Float64
+    """(k, 4, 4) the starts."""
+    registrations: Registrations
+    """What became of them."""
+    along: Float64
+    """(k,) error along the true heading [m], forward positive."""
+    across: Float64
+    """(k,) error across it [m], left positive."""
+    up: Float64
+    """(k,) error in map z [m]."""
+    yaw: Float64
+    """(k,) error of the heading [rad], in [-pi, pi)."""
+    error: Float64
+    """(k,) 3D norm of the error [m]."""
+    error_mean: float
+    """Mean 3D error of all starts [m]: the label of the paper."""
+    p_fail: float
+    """Share of starts that failed, no unit."""
+    mean_held: float
+    """Mean 3D error of the starts that did not fail [m]."""
+    median_held: float
+    """Median of the same [m]."""
+    p95_held: float
+    """Their 95th percentile [m], linear between ranks."""
+    along_mean: float
+    """Mean of abs(along) over all starts [m]."""
+    across_mean: float
+    """Mean of abs(across) [m]."""
+    up_mean: float
+    """Mean of abs(up) [m]."""
+    yaw_mean: float
+    """Mean of abs(yaw) [rad]."""
+    error_floor: float
+    """Mean 3D error of the starts within 1.0 m of the true position [m]."""
+    error_tail: float
+    """error_mean - error_floor [m]."""
+
+    @property
+    def converged(self) -> NDArray[np.bool_]:
+        """(k,) whether the start converged."""
+        return self.registrations.converged
+
+    @property
+    def iterations(self) -> Int64:
+        """(k,) Newton steps taken."""
+        return self.registrations.iterations

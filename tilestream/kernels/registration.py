@@ -1,0 +1,186 @@
+"""3D-NDT registration of a scan from many starts: Newton steps until one is short (definitions, 5).
+
+What a start ends with does not depend on the starts before it: slots either hold what an anchor
+alone decides, or are forgotten before a start.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from tilestream.kernels.newton import SUMS, M, assemble, definite_step, raw_step
+from tilestream.kernels.slots import FAR, LN4, best_of_cells, forget_rows, sums_at
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Int32 = NDArray[np.int32]
+Int64 = NDArray[np.int64]
+
+SMALL_ANGLE = 1.0e-4
+"""Euler angles below this [rad] count as 0 in the derivatives, as in PCL and Autoware."""
+
+
+class LocalMap(NamedTuple):
+    """The cells around a scan, as the kernel reads them. Anchors: see kernels/anchors.py."""
+
+    shape: Int64
+    """(3,) number of anchors of the dense grid."""
+    edge: float
+    """Edge of an anchor [m]."""
+    first: Int32
+    """(anchors + 1,) where the list of an anchor begins in `cell` and `shift`."""
+    cell: Int32
+    """(entries,) rows of `table`."""
+    shift: Int32
+    """(entries,) packed shifts from the anchor to the cell's corner [anchor edges]."""
+    table: Float32
+    """(cells, 9) mean from the cell's corner [m], inverse covariance xx xy xz yy yz zz times
+    d2 / 2 log2(e) [1/m^2]."""
+    reach: float
+    """Radius within which a cell counts [m]; 0 where the anchor's list decides alone."""
+    d1: float
+    """Magnusson's d1 < 0, no unit."""
+
+
+class Rule(NamedTuple):
+    """How to step; see RegistrationSettings."""
+
+    definite: bool
+    euler: bool
+    step_max: float
+    epsilon: float
+    iterations_max: int
+
+
+class Aligned(NamedTuple):
+    """What `align` fills, a row per start."""
+
+    R: Float64
+    """(k, 3, 3) rotations; in: the starts'."""
+    t: Float64
+    """(k, 3) translations from the corner of the start's anchor [m]; in: the starts'."""
+    converged: NDArray[np.bool_]
+    """(k,) whether the last step was shorter than epsilon."""
+    iterations: Int64
+    """(k,) steps taken."""
+    score: Float64
+    """(k,) sum over points and their cells of -d1 p at the final pose."""
+    best: Float64
+    """(k,) sum over points of their best cell's -d1 p."""
+    hits: Int64
+    """(k,) points with at least one cell."""
+    hits_at_start: Int64
+    """(k,) the same at the start."""
+    hessian: Float64
+    """(k, 6, 6) of the score at the final pose, for steps (tau, w) [m, rad]."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _exponential(w: Float64, R: Float64) -> None:
+    """R <- Exp(w) R, by Rodrigues' formula."""
+    angle = math.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+    if angle < 1e-8:
+        a, b = 1.0, 0.5
+    else:
+        a, b = math.sin(angle) / angle, 2.0 * (math.sin(0.5 * angle) / angle) ** 2
+    for j in range(3):
+        x, y, z = R[0, j], R[1, j], R[2, j]
+        cx, cy, cz = w[1] * z - w[2] * y, w[2] * x - w[0] * z, w[0] * y - w[1] * x
+        R[0, j] = x + a * cx + b * (w[1] * cz - w[2] * cy)
+        R[1, j] = y + a * cy + b * (w[2] * cx - w[0] * cz)
+        R[2, j] = z + a * cz + b * (w[0] * cy - w[1] * cx)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _euler_angles(R: Float64, angles: Float64) -> None:
+    """The angles (rx, ry, rz) of R = Rx Ry Rz [rad]."""
+    angles[0] = math.atan2(-R[1, 2], R[2, 2])
+    angles[1] = math.asin(min(max(R[0, 2], -1.0), 1.0))
+    angles[2] = math.atan2(-R[0, 1], R[0, 0])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _from_euler(angles: Float64, ignored: float, R: Float64, axes: Float64) -> None:
+    """R = Rx Ry Rz and the axes ex, Rx ey, Rx Ry ez of its angles; angles below `ignored` are 0."""
+    rx, ry, rz = angles[0], angles[1], angles[2]
+    sx, cx = (0.0, 1.0) if abs(rx) < ignored else (math.sin(rx), math.cos(rx))
+    sy, cy = (0.0, 1.0) if abs(ry) < ignored else (math.sin(ry), math.cos(ry))
+    sz, cz = (0.0, 1.0) if abs(rz) < ignored else (math.sin(rz), math.cos(rz))
+    R[0, 0], R[0, 1], R[0, 2] = cy * cz, -cy * sz, sy
+    R[1, 0], R[1, 1], R[1, 2] = cx * sz + sx * sy * cz, cx * cz - sx * sy * sz, -sx * cy
+    R[2, 0], R[2, 1], R[2, 2] = sx * sz - cx * sy * cz, sx * cz + cx * sy * sz, cx * cy
+    axes[0, 0], axes[1, 0], axes[2, 0] = 1.0, 0.0, 0.0
+    axes[0, 1], axes[1, 1], axes[2, 1] = 0.0, cx, sx
+    axes[0, 2], axes[1, 2], axes[2, 2] = sy, -sx * cy, cx * cy
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _scale(sums: Float64, d1: float) -> None:
+    """Give the sums of kernels/slots.py their constants (see kernels/newton.py)."""
+    for k in range(SUMS + 1):
+        sums[k] *= -d1 * LN4 if M <= k < SUMS else -d1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def align(points, corner, local, rule, seven, limit, state, out):  # type: ignore[no-untyped-def]
+    """Register a scan from every start; fills `out` (an `Aligned`).
+
+    Args:
+        points: (3, n) scan in the lidar frame [m], float64.
+        corner: (k, 3) the anchor, on the local grid, that `out.t` of each start counts from.
+        local: the cells around the scan.
+        rule: how to step.
+        seven: None for one slot per point, True for seven.
+        limit: None, or the squared reach [m^2], float32.
+        state: slots for n points, as `seven` says.
+        out: starts in, results out.
+    """
+    slots = 1 if seven is None else 7
+    far = np.float32(FAR * local.edge)
+    nearby = np.float32((0.1 * FAR * local.edge) ** 2) if limit is None else limit
+    sums, g, H, d = np.empty(SUMS + 1), np.empty(6), np.empty((6, 6)), np.empty(6)
+    identity, axes, lever, angles = np.eye(3), np.eye(3), np.eye(3), np.empty(3)
+    for s in range(out.R.shape[0]):
+        R, t = out.R[s], out.t[s]
+        forget_rows(state, slots, far)
+        if rule.euler:
+            _euler_angles(R, angles)
+        hits_at_start = -1
+        norm = math.inf
+        steps = 0
+        while steps < rule.iterations_max and not norm < rule.epsilon:
+            if rule.euler:
+                _from_euler(angles, SMALL_ANGLE, lever, axes)
+            else:
+                lever[:] = R
+            sums_at(state, points, R, lever, t, corner[s], local, seven, limit, sums)
+            if steps == 0:
+                hits_at_start = best_of_cells(state, slots, nearby)[1]
+            _scale(sums, local.d1)
+            assemble(sums, axes, rule.euler, g, H)
+            if rule.definite:
+                norm = definite_step(g, H, rule.step_max, d)
+            else:
+                norm = raw_step(g, H, rule.step_max, 0.5 * rule.epsilon, d)
+            for i in range(3):
+                t[i] += d[i]
+            if rule.euler:
+                for i in range(3):
+                    angles[i] += d[3 + i]
+                _from_euler(angles, 0.0, R, axes)
+            else:
+                _exponential(d[3:], R)
+            steps += 1
+        sums_at(state, points, R, R, t, corner[s], local, seven, limit, sums)
+        best, hits = best_of_cells(state, slots, nearby)
+        _scale(sums, local.d1)
+        assemble(sums, identity, False, g, out.hessian[s])
+        out.score[s] = sums[SUMS]
+        out.best[s] = -local.d1 * best
+        out.hits[s] = hits
+        out.hits_at_start[s] = hits if hits_at_start < 0 else hits_at_start
+        out.iterations[s] = steps
+        out.converged[s] = norm < rule.epsilon and hits > 0

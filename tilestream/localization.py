@@ -1,0 +1,443 @@
+"""Registration of a scan in the map, and how far it ends from the truth (definitions, section 5).
+
+A scan is thinned, the cells around it become a local map, every start steps on it until it rests;
+the label of a place is what 317 starts around the true pose end with.
+"""
+
+import logging
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tilestream.config import RegistrationSettings, StartSettings
+from tilestream.errors import RegistrationError, UsageError
+from tilestream.kernels.anchors import neighbour_lists
+from tilestream.kernels.density import magnusson_constants
+from tilestream.kernels.registration import Aligned, LocalMap, Rule, align
+from tilestream.kernels.slots import empty_slots
+from tilestream.records import Cells, Float64, Int64, LocalizationError, Registrations, TruePose
+from tilestream.tiling import MM_PER_M, whole_mm
+
+LEAST_POINTS = 10
+"""Fewest points of a scan that is registered, as given and after thinning."""
+LARGEST_SCAN = 10_000.0
+"""Largest distance of a scan point from the lidar [m]; a farther one is in another frame."""
+RIGID = 1e-4
+"""How far R^T R of a start may be from the identity: poses are often written with 6 digits."""
+MAX_ANCHORS = 2**28
+"""Largest dense grid around a scan."""
+FAILED = 0.5
+"""3D error beyond which a start has failed [m]."""
+NEAR = 1.0
+"""Starts within this distance of the true position make `error_floor` [m]."""
+FINE_CELL, FINE_RADIUS, FINE_STEP = 1.0, 0.5, 0.05
+"""The refined true pose: cell size, search radius and step [m] (the paper's section VI)."""
+
+_log = logging.getLogger(__name__)
+
+
+def disc_starts(radius: float = 2.0, step: float = 0.2) -> Float64:
+    """Offsets (i, j) * step with i^2 + j^2 <= (radius / step)^2, i slowest: the paper's particles.
+
+    Decided in whole millimetres, i^2 + j^2 in whole numbers of steps: exactly 317 by default,
+    where floats would lose some.
+
+    Args:
+        radius: radius of the disc [m], whole millimetres.
+        step: spacing [m], whole millimetres.
+
+    Returns:
+        (k, 2) offsets in map x and y [m].
+
+    Raises:
+        UsageError: not whole millimetres, a negative radius, a step that is not positive.
+    """
+    radius_mm, step_mm = whole_mm(radius, "radius"), whole_mm(step, "step")
+    if radius_mm < 0 or step_mm <= 0:
+        raise UsageError(f"radius {radius!r} m, step {step!r} m: give >= 0 and > 0")
+    reach = radius_mm // step_mm
+    i, j = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1)
+    inside = (i * i + j * j) * step_mm**2 <= radius_mm**2
+    offsets: Float64 = np.column_stack([i, j])[inside] * step_mm / MM_PER_M
+    return offsets
+
+
+def start_poses(T_map_lidar: ArrayLike, settings: StartSettings | None = None) -> Float64:
+    """The starts around a true pose: the disc, for each z, for each yaw (yaw fastest).
+
+    Args:
+        T_map_lidar: (4, 4) true pose.
+        settings: the disc, and yaw and z offsets; default: 317 starts at true z and orientation.
+
+    Returns:
+        (k, 4, 4) poses.
+
+    Raises:
+        RegistrationError: the pose is not rigid or not finite.
+    """
+    settings = settings or StartSettings()
+    T_map_true = _rigid(T_map_lidar, "the true pose")[0]
+    disc = disc_starts(settings.radius, settings.step)
+    yaws = np.zeros((len(settings.yaw), 3, 3))
+    for turn, yaw in zip(yaws, settings.yaw, strict=True):
+        c, s = math.cos(yaw), math.sin(yaw)
+        turn[:] = [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]
+    shape = (len(disc), len(settings.z), len(settings.yaw))
+    poses = np.broadcast_to(T_map_true, (*shape, 4, 4)).copy()
+    poses[..., :2, 3] += disc[:, None, None]
+    poses[..., 2, 3] += np.array(settings.z)[:, None]
+    if settings.yaw != (0.0,):
+        poses[..., :3, :3] = yaws @ T_map_true[:3, :3]
+    return poses.reshape(-1, 4, 4)
+
+
+def register(
+    cells: Cells,
+    scan_points: ArrayLike,
+    T_map_lidar_starts: ArrayLike,
+    settings: RegistrationSettings | None = None,
+) -> Registrations:
+    """Register a scan in the map by 3D-NDT from every start.
+
+    The result of a start is the same to the bit on every run, in whatever company and order of
+    starts, and in whatever order the scan's points come.
+
+    Args:
+        cells: cells of the map that cover what the scan sees from the starts, and 3 m more (the
+            way that a start can go); others are ignored.
+        scan_points: (n, 3) points in the lidar frame [m], finite. Thinned to `settings.scan_leaf`.
+        T_map_lidar_starts: (k, 4, 4) start poses, or one (4, 4).
+        settings: the matcher; default `RegistrationSettings()`.
+
+    Raises:
+        RegistrationError: fewer than 10 points, or after thinning; points or starts that are not
+            finite; starts that are not rigid; no cells near the scan, or a start from which it hits
+            none.
+    """
+    settings = settings or RegistrationSettings()
+    points = _thinned(_scan(scan_points), settings.scan_leaf)
+    starts = _rigid(T_map_lidar_starts, "start")
+    local, origin = _local_map(cells, points, starts, settings)
+    corner = np.floor(starts[:, :3, 3] / local.edge).astype(np.int64)
+    corner_m = corner * (local.edge * MM_PER_M) / MM_PER_M
+    out = _nothing_yet(starts[:, :3, :3], starts[:, :3, 3] - corner_m)
+    rule = Rule(
+        settings.solver == "definite",
+        settings.rotation == "euler",
+        settings.step_max,
+        settings.epsilon,
+        settings.iterations_max,
+    )
+    seven = None if settings.neighbours == "direct1" else True
+    limit = np.float32(local.reach**2) if local.reach else None
+    slots = empty_slots(len(points), 7 if seven else 1, int(np.diff(local.first).max()))
+    if not align.signatures:
+        _log.info("loading the registration kernels; the first time, compiling them for a minute")
+    align(np.ascontiguousarray(points.T), corner - origin, local, rule, seven, limit, slots, out)
+    _require_hits(out.hits_at_start, starts)
+    T_map_lidar = starts.copy()
+    T_map_lidar[:, :3, :3] = out.R
+    T_map_lidar[:, :3, 3] = out.t + corner_m
+    return Registrations(
+        T_map_lidar=T_map_lidar,
+        converged=out.converged,
+        iterations=out.iterations,
+        score=out.score,
+        nvtl=out.best / len(points),
+        hits=out.hits,
+        hessian=out.hessian,
+        points=len(points),
+    )
+
+
+def localization_error(
+    cells: Cells,
+    scan_points: ArrayLike,
+    T_map_lidar: ArrayLike,
+    starts: ArrayLike | None = None,
+    settings: RegistrationSettings | None = None,
+    start_settings: StartSettings | None = None,
+    true_pose: TruePose = "log",
+) -> LocalizationError:
+    """Where registrations end that start around the true pose: the label of a sample point.
+
+    Args:
+        cells: cells of the map around the scan (see `register`).
+        scan_points: (n, 3) points in the lidar frame [m].
+        T_map_lidar: (4, 4) true pose of the lidar.
+        starts: (k, 2) offsets in map x and y [m] at true z and orientation, or (k, 4, 4) poses;
+            None: those of `start_settings`.
+        settings: the matcher; default `RegistrationSettings()`.
+        start_settings: the starts; default the paper's 317.
+        true_pose: where `T_map_lidar` is from; recorded.
+
+    Raises:
+        RegistrationError: as `register`.
+        UsageError: `starts` and `start_settings` both given, or starts of another shape or none.
+    """
+    T_map_true = _rigid(T_map_lidar, "the true pose")[0]
+    T_map_lidar_starts = _starts(T_map_true, starts, start_settings)
+    found = register(cells, scan_points, T_map_lidar_starts, settings)
+    heading = math.atan2(T_map_true[1, 0], T_map_true[0, 0])
+    forward = np.array([math.cos(heading), math.sin(heading)])
+    offset = found.T_map_lidar[:, :3, 3] - T_map_true[:3, 3]
+    along = offset[:, :2] @ forward
+    across = offset[:, 1] * forward[0] - offset[:, 0] * forward[1]
+    turned = np.arctan2(found.T_map_lidar[:, 1, 0], found.T_map_lidar[:, 0, 0]) - heading
+    yaw = (turned + np.pi) % (2.0 * np.pi) - np.pi
+    error = np.sqrt((offset**2).sum(axis=1))
+    distance = np.linalg.norm(T_map_lidar_starts[:, :3, 3] - T_map_true[:3, 3], axis=1)
+    held = error[error <= FAILED]
+    error_floor = _mean(error[distance <= NEAR + 1e-9])
+    return LocalizationError(
+        T_map_lidar=T_map_true,
+        true_pose=true_pose,
+        T_map_lidar_starts=T_map_lidar_starts,
+        registrations=found,
+        along=along,
+        across=across,
+        up=offset[:, 2],
+        yaw=yaw,
+        error=error,
+        error_mean=_mean(error),
+        p_fail=_mean(error > FAILED),
+        mean_held=_mean(held),
+        median_held=float(np.median(held)) if held.size else math.nan,
+        p95_held=float(np.percentile(held, 95.0)) if held.size else math.nan,
+        along_mean=_mean(np.abs(along)),
+        across_mean=_mean(np.abs(across)),
+        up_mean=_mean(np.abs(offset[:, 2])),
+        yaw_mean=_mean(np.abs(yaw)),
+        error_floor=error_floor,
+        error_tail=_mean(error) - error_floor,
+    )
+
+
+def refined_pose(
+    fine_cells: Cells,
+    scan_points: ArrayLike,
+    T_map_log: ArrayLike,
+    settings: RegistrationSettings | None = None,
+) -> Float64:
+    """The paper's ground truth, in two steps on cells of 1.0 m, from the pose of a log.
+
+    Register from the log's pose; then the best direct7 score over the 0.05 m lattice in map x and
+    y within 0.5 m of where that ended, at its z and orientation (equal scores: the first, x
+    slowest). It shares its scan with what it judges: pass `true_pose="refined"` on.
+
+    Args:
+        fine_cells: cells of 1.0 m around the scan.
+        scan_points: (n, 3) points in the lidar frame [m].
+        T_map_log: (4, 4) pose of the log.
+        settings: the matcher of the first step; default `RegistrationSettings(scan_leaf=1.0)`, as
+            the paper thins the scan by the cell size.
+
+    Returns:
+        (4, 4) the refined pose.
+
+    Raises:
+        UsageError: cells of another size.
+        RegistrationError: as `register`, or the first step did not converge.
+    """
+    if fine_cells.cell_size != FINE_CELL:
+        raise UsageError(
+            f"a refined pose needs cells of {FINE_CELL:g} m, not of {fine_cells.cell_size:g} m"
+        )
+    settings = settings or RegistrationSettings(scan_leaf=FINE_CELL)
+    rough = register(fine_cells, scan_points, T_map_log, settings)
+    if not rough.converged[0]:
+        raise RegistrationError(
+            f"the log's pose cannot be refined: no convergence after {rough.iterations[0]} steps"
+        )
+    particles = start_poses(rough.T_map_lidar[0], StartSettings(radius=FINE_RADIUS, step=FINE_STEP))
+    scoring = settings.model_copy(update={"neighbours": "direct7", "iterations_max": 0})
+    scores = register(fine_cells, scan_points, particles, scoring).score
+    best: Float64 = particles[int(np.argmax(scores))]
+    return best
+
+
+def _scan(scan_points: ArrayLike) -> Float64:
+    """The scan's points, refused if they are none."""
+    points = np.asarray(scan_points)
+    if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "iuf":
+        raise RegistrationError(
+            f"the scan has shape {points.shape} and type {points.dtype}: "
+            "give (n, 3) points in the lidar frame [m]"
+        )
+    points = points.astype(np.float64)
+    if len(points) < LEAST_POINTS:
+        raise RegistrationError(f"the scan has {len(points)} points: give at least {LEAST_POINTS}")
+    broken = ~np.isfinite(points).all(axis=1)
+    if broken.any():
+        raise RegistrationError(
+            f"{broken.sum()} of {len(points)} scan points are not finite, "
+            f"the first at row {np.argmax(broken)}: leave them out"
+        )
+    reach = float(np.linalg.norm(points, axis=1).max())
+    if reach > LARGEST_SCAN:
+        raise RegistrationError(
+            f"a scan point lies {reach:.0f} m from the lidar: give points in the lidar frame"
+        )
+    return points
+
+
+def _thinned(points: Float64, leaf: float) -> Float64:
+    """The centroid of each voxel of the lidar frame's lattice, by voxel index; leaf 0: as given.
+
+    Sums are fixed point, 2^-30 m: the order of the points does not show. Neither does it with
+    leaf 0, where the points are only sorted.
+    """
+    leaf = whole_mm(leaf, "scan_leaf") / MM_PER_M
+    if leaf == 0.0:
+        return points[np.lexsort(points.T[::-1])]
+    voxel = np.floor(points / leaf)
+    order = np.lexsort(voxel.T[::-1])
+    points, voxel = points[order], voxel[order]
+    begins = np.flatnonzero(np.r_[True, (voxel[1:] != voxel[:-1]).any(axis=1)])
+    if len(begins) < LEAST_POINTS:
+        raise RegistrationError(
+            f"the scan has {len(begins)} points after thinning to {leaf:g} m: "
+            f"give at least {LEAST_POINTS}, or a smaller scan_leaf"
+        )
+    offset = np.rint((points - voxel * leaf) * 2.0**30).astype(np.int64)
+    count = np.diff(np.r_[begins, len(points)])
+    centroid = np.add.reduceat(offset, begins) / count[:, None] / 2.0**30
+    thinned: Float64 = voxel[begins] * leaf + centroid
+    return thinned
+
+
+def _rigid(T: ArrayLike, name: str) -> Float64:
+    """Poses (k, 4, 4) as float64, refused unless all are rigid and finite."""
+    poses = np.asarray(T)
+    if poses.dtype.kind not in "iuf" or poses.shape[-2:] != (4, 4) or poses.ndim not in (2, 3):
+        raise RegistrationError(f"{name}: shape {poses.shape}, give (k, 4, 4) poses or one (4, 4)")
+    poses = poses.astype(np.float64).reshape(-1, 4, 4)
+    if not len(poses):
+        raise RegistrationError(f"{name}: no poses, give at least one")
+    R = poses[:, :3, :3]
+    finite = np.isfinite(poses).all(axis=(1, 2))
+    with np.errstate(invalid="ignore", over="ignore"):
+        skew = np.abs(R.transpose(0, 2, 1) @ R - np.eye(3)).max(axis=(1, 2))
+        rigid = (skew <= RIGID) & (np.linalg.det(R) > 0.0)
+    rigid &= (poses[:, 3] == [0.0, 0.0, 0.0, 1.0]).all(axis=1)
+    for good, what in ((finite, "not finite"), (rigid, "not a rotation and a translation")):
+        if not good.all():
+            row = int(np.argmin(good))
+            which = name if len(poses) == 1 else f"{name} {row} of {len(poses)}"
+            raise RegistrationError(f"{which} is {what}:\n{poses[row]}")
+    return poses
+
+
+def _starts(
+    T_map_true: Float64, starts: ArrayLike | None, settings: StartSettings | None
+) -> Float64:
+    """The start poses that the arguments of `localization_error` mean."""
+    if starts is None:
+        return start_poses(T_map_true, settings)
+    if settings is not None:
+        raise UsageError("starts and start_settings are both given: give one of them")
+    given = np.asarray(starts)
+    if given.ndim == 3:
+        return _rigid(given, "start")
+    if given.ndim != 2 or given.shape[1] != 2 or not len(given) or given.dtype.kind not in "iuf":
+        raise UsageError(
+            f"starts have shape {given.shape}: give (k, 2) offsets [m] or (k, 4, 4) poses"
+        )
+    poses = np.repeat(T_map_true[None], len(given), axis=0)
+    poses[:, :2, 3] += given
+    return _rigid(poses, "start")
+
+
+def _local_map(
+    cells: Cells, points: Float64, starts: Float64, settings: RegistrationSettings
+) -> tuple[LocalMap, Int64]:
+    """The cells that the scan can come near from the starts, on a dense grid.
+
+    And the grid's origin [anchors of the map's lattice].
+    """
+    size = cells.cell_size
+    halves, span = (2, 3) if settings.neighbours == "radius" else (1, 1)
+    span = 0 if settings.neighbours == "direct1" else span
+    near = _near(cells, points, starts, settings)
+    index, mean = cells.index[near], cells.mean[near]
+    low = index.min(axis=0) * halves - span - 1
+    shape = index.max(axis=0) * halves - low + span + 2
+    if math.prod(shape.tolist()) > MAX_ANCHORS:
+        raise RegistrationError(
+            f"the scan and its starts span {shape} voxels of {size / halves:g} m: "
+            "register fewer starts at once, or use larger cells"
+        )
+    offset = mean - index * cells.cell_mm / MM_PER_M
+    reach = size if settings.neighbours == "radius" else 0.0
+    edge = size / halves
+    d1, d2 = magnusson_constants(size, settings.outlier_ratio)
+    inverse = _inverse_covariance(cells, near, settings) * (0.5 * d2 * math.log2(math.e))
+    upper = np.triu_indices(3)
+    table = np.column_stack([offset, inverse[:, upper[0], upper[1]]]).astype(np.float32)
+    first, cell, shift = neighbour_lists(
+        index * halves - low, offset / edge, shape, span, reach / edge
+    )
+    return LocalMap(shape, edge, first, cell, shift, table, reach, d1), low
+
+
+def _near(
+    cells: Cells, points: Float64, starts: Float64, settings: RegistrationSettings
+) -> NDArray[np.intp]:
+    """Rows of the cells in the box that the scan can reach: its radius and the longest way."""
+    steps = settings.iterations_max * max(settings.step_max, settings.epsilon)
+    way = float(np.linalg.norm(points, axis=1).max()) + steps + 2.0 * cells.cell_size
+    where = starts[:, :3, 3]
+    low = np.floor((where.min(axis=0) - way) / cells.cell_size)
+    high = np.floor((where.max(axis=0) + way) / cells.cell_size)
+    near = np.flatnonzero(((cells.index >= low) & (cells.index <= high)).all(axis=1))
+    if not near.size:
+        place = ", ".join(f"{c:.1f}" for c in where.mean(axis=0))
+        raise RegistrationError(
+            f"no cells within {way:.0f} m of the starts around ({place}): "
+            "the scan lies outside the map, or its pose is in another frame"
+        )
+    return near
+
+
+def _inverse_covariance(
+    cells: Cells, rows: NDArray[np.intp], settings: RegistrationSettings
+) -> Float64:
+    """(m, 3, 3) inverse covariances of the density [1/m^2]."""
+    if settings.covariance == "regularised":
+        return cells.precision[rows]
+    seed = 1.0 / np.maximum(cells.count[rows] - 1, 1)
+    values = cells.eigenvalues[rows] + seed[:, None]
+    values = np.maximum(values, 0.01 * values[:, :1])
+    vectors = cells.eigenvectors[rows]
+    inverse: Float64 = (vectors / values[:, None, :]) @ vectors.transpose(0, 2, 1)
+    return inverse
+
+
+def _nothing_yet(R: Float64, t: Float64) -> Aligned:
+    k = len(R)
+    return Aligned(
+        R=np.ascontiguousarray(R),
+        t=np.ascontiguousarray(t),
+        converged=np.zeros(k, np.bool_),
+        iterations=np.zeros(k, np.int64),
+        score=np.zeros(k),
+        best=np.zeros(k),
+        hits=np.zeros(k, np.int64),
+        hits_at_start=np.zeros(k, np.int64),
+        hessian=np.zeros((k, 6, 6)),
+    )
+
+
+def _require_hits(hits_at_start: Int64, starts: Float64) -> None:
+    lost = np.flatnonzero(hits_at_start == 0)
+    if lost.size:
+        place = ", ".join(f"{c:.1f}" for c in starts[lost[0], :3, 3])
+        raise RegistrationError(
+            f"the scan hits no cell from {lost.size} of {len(starts)} starts, "
+            f"the first at ({place}) (row {lost[0]}): the map has nothing there"
+        )
+
+
+def _mean(values: NDArray[np.float64] | NDArray[np.bool_]) -> float:
+    return float(values.mean()) if values.size else math.nan
