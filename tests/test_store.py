@@ -55,7 +55,9 @@ def test_tiles_own_every_point_once(store: ts.TileStore, cloud: np.ndarray) -> N
     assert as_set(stored) == as_set(cloud)
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(
     tile=st.sampled_from([2.0, 3.5, 10.0, 64.0]),
     halo=st.sampled_from([0.0, 0.4, 3.0, 11.0]),
@@ -178,7 +180,7 @@ def test_a_store_says_what_it_is(store: ts.TileStore) -> None:
 
 def test_a_store_travels_to_workers(store: ts.TileStore) -> None:
     key = store.keys()[0]
-    there = pickle.loads(pickle.dumps(store))  # noqa: S301
+    there = pickle.loads(pickle.dumps(store))
     np.testing.assert_array_equal(there.tile(key).points(), store.tile(key).points())
 
 

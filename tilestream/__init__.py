@@ -15,6 +15,7 @@ from tilestream.sensors import Sensor as Sensor
 from tilestream.store import Tile as Tile
 from tilestream.store import TileStore as TileStore
 from tilestream.store import open_store as open_store
+from tilestream.tiling import TileKey as TileKey
 from tilestream.version import VERSION
 
 __version__ = VERSION

@@ -39,8 +39,9 @@ from tilestream.errors import (
     TilestreamError,
     UsageError,
 )
-from tilestream.formats import describe
+from tilestream.formats import open_source
 from tilestream.formats.base import SourceInfo
+from tilestream.formats.mcap import ScanSelection
 from tilestream.store import POINTS, TileStore, open_store
 from tilestream.version import VERSION
 
@@ -55,6 +56,12 @@ err = Console(stderr=True)
 
 SCHEDULER = typer.Option(help="Run on this Dask scheduler, e.g. tcp://10.0.0.1:8786.")
 WORKERS = typer.Option(min=1, help="Worker processes on this machine; 1: this process.")
+POINTS_TOPIC = typer.Option(help="Topic of the scans in a log; default: found by type.")
+POSE_TOPIC = typer.Option(help="Topic of the poses in a log; default: found by type.")
+EVERY = typer.Option(min=1, help="Use every n-th scan of a log …")
+OFFSET = typer.Option(min=0, help="… from this one on: another offset uses other scans.")
+FROM_S = typer.Option(help="Use the scans of a log from this time on [s after its first].")
+UNTIL_S = typer.Option(help="Use the scans of a log before this time [s after its first].")
 MEMORY = typer.Option(help="What one task may use, e.g. 512MB or 2GB.")
 
 
@@ -162,6 +169,12 @@ def ingest(
         float, typer.Option(help="Thin to one point per voxel [m]; 0: keep.")
     ] = 0.2,
     crs: Annotated[str | None, typer.Option(help="CRS of the map, e.g. EPSG:6677.")] = None,
+    points_topic: Annotated[str | None, POINTS_TOPIC] = None,
+    pose_topic: Annotated[str | None, POSE_TOPIC] = None,
+    every: Annotated[int, EVERY] = 1,
+    offset: Annotated[int, OFFSET] = 0,
+    from_s: Annotated[float, FROM_S] = 0.0,
+    until_s: Annotated[float | None, UNTIL_S] = None,
     memory: Annotated[str, MEMORY] = megabytes(DEFAULT_MEMORY).replace(" ", "").replace(",", ""),
     scheduler: Annotated[str | None, SCHEDULER] = None,
     workers: Annotated[int, WORKERS] = 1,
@@ -170,14 +183,24 @@ def ingest(
     """Make a tile store from point clouds, map directories and logs of drives."""
     settings = IngestSettings(tile_size=tile_size, halo=halo, map_leaf=map_leaf, crs=crs)
     allowed = parse_bytes(memory)
+    scans = ScanSelection(every=every, offset=offset, from_s=from_s, until_s=until_s)
     if dry_run:
-        out.print(plan_table(jobs.plan_ingest(sources, store, settings, allowed)))
+        plan = jobs.plan_ingest(sources, store, settings, allowed, points_topic, pose_topic, scans)
+        out.print(plan_table(plan))
         return
     failed: PartialError | None = None
     with dask_client(scheduler, workers, allowed) as client, progress() as watch:
         try:
             jobs.ingest(
-                sources, store, **settings.model_dump(), client=client, memory=allowed, watch=watch
+                sources,
+                store,
+                **settings.model_dump(),
+                client=client,
+                memory=allowed,
+                watch=watch,
+                points_topic=points_topic,
+                pose_topic=pose_topic,
+                scans=scans,
             )
         except PartialError as error:
             failed = error
@@ -219,7 +242,7 @@ def info(
     as_json: Annotated[bool, typer.Option("--json", help="For machines.")] = False,
 ) -> None:
     """Show what is in a file or log: points, bounds, fields, topics, CRS."""
-    found = describe(file)
+    found = open_source(file).info()
     if as_json:
         print_json(asdict(found))
     else:

@@ -24,11 +24,13 @@ from tilestream.errors import (
     CrsError,
     PartialError,
     SourceError,
+    SourceNotFoundError,
     StoreNotFoundError,
     UsageError,
 )
 from tilestream.formats import expand_sources, open_source
 from tilestream.formats.base import SourceInfo, Span
+from tilestream.formats.mcap import ScanSelection
 from tilestream.ingest import Fragment
 from tilestream.store import POINTS, Mark, StoreSettings, Tile, TileStore, hash_of, open_store
 
@@ -48,6 +50,8 @@ class Source:
     """What is in it; None where it could not be opened."""
     spans: tuple[Span, ...] = ()
     """The pieces in which it is read."""
+    options: tuple[tuple[str, Any], ...] = ()
+    """How it is read: topics and scans of a log."""
     points: int = 0
     """Finite points that were read."""
     dropped: int = 0
@@ -67,7 +71,9 @@ def ingest(
     client: Any | None = None,
     memory: int = DEFAULT_MEMORY,
     watch: Watch | None = None,
-    **options: Any,
+    points_topic: str | None = None,
+    pose_topic: str | None = None,
+    scans: ScanSelection | None = None,
 ) -> TileStore:
     """Make a tile store from point clouds, map directories and logs of drives.
 
@@ -86,7 +92,9 @@ def ingest(
         client: a Dask client to run on; None: this process.
         memory: what a task may use [bytes].
         watch: is told of each task that ended.
-        options: how logs are read, e.g. `points_topic="/lidar"`.
+        points_topic: topic of the scans in MCAP logs; None: found by type.
+        pose_topic: topic of the poses in MCAP logs; None: found by type.
+        scans: which scans of MCAP logs become the map; None: all.
 
     Returns:
         The store, with every tile that holds a point.
@@ -100,11 +108,11 @@ def ingest(
             the rest is done and can be opened.
     """
     settings = IngestSettings(tile_size=tile_size, halo=halo, map_leaf=map_leaf, crs=crs)
-    found = [_examine(path, options) for path in expand_sources(_listed(sources))]
+    found = _examine_all(sources, _log_options(points_topic, pose_topic, scans))
     store = _create_or_resume(str(url), _with_crs(settings, found), found)
     if _is_current(store, found):
         return store
-    scatters = _plan_reading(store, found, memory, options)
+    scatters = _plan_reading(store, found, memory)
     found, fragments = _sort_out(found, scatters, execute(scatters.tasks, client, watch))
     merges = plan_merge(
         store.url, fragments, store.settings.tile_size, store.settings.map_leaf, memory
@@ -121,42 +129,72 @@ def plan_ingest(
     url: str | os.PathLike[str],
     settings: IngestSettings,
     memory: int = DEFAULT_MEMORY,
-    **options: Any,
+    points_topic: str | None = None,
+    pose_topic: str | None = None,
+    scans: ScanSelection | None = None,
 ) -> Plan:
     """What `ingest` would read first, without running or writing anything.
 
     The tasks that write tiles are planned from what the reading finds. Arguments and errors as for
     `ingest`; a source that cannot be opened raises its own error here.
     """
-    found = [_examine(path, options) for path in expand_sources(_listed(sources))]
+    found = _examine_all(sources, _log_options(points_topic, pose_topic, scans))
     for source in found:
         if source.reason:
             raise SourceError(source.reason)
     store = TileStore(str(url), StoreSettings(**_with_crs(settings, found).model_dump()))
-    return _plan_reading(store, found, memory, options)
+    return _plan_reading(store, found, memory)
 
 
-def _listed(
-    sources: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
-) -> list[str]:
+def _log_options(
+    points_topic: str | None, pose_topic: str | None, scans: ScanSelection | None
+) -> dict[str, Any]:
+    wanted = {"points_topic": points_topic, "pose_topic": pose_topic, "scans": scans}
+    return {name: value for name, value in wanted.items() if value is not None}
+
+
+def _examine_all(
+    sources: str | os.PathLike[str] | Iterable[str | os.PathLike[str]], log_options: dict[str, Any]
+) -> list[Source]:
+    """Every file that the sources name, opened as far as its header.
+
+    Raises:
+        UsageError: there are no sources.
+        SourceNotFoundError: a path or glob that matches nothing.
+    """
     if isinstance(sources, str | os.PathLike):
         sources = [sources]
-    listed = [os.fspath(source) for source in sources]
-    if not listed:
+    found: dict[str, Source] = {}
+    for pattern in [os.fspath(source) for source in sources]:
+        try:
+            crs = open_source(pattern).info().crs if Path(pattern).is_dir() else None
+            paths = expand_sources(pattern)
+        except SourceNotFoundError:
+            raise
+        except SourceError as error:
+            found[pattern] = Source(pattern, state="", reason=str(error))
+            continue
+        for path in paths:
+            options = log_options if path.lower().endswith(".mcap") else {}
+            absolute = str(Path(path).absolute())
+            found.setdefault(absolute, _examine(absolute, options, crs))
+    if not found:
         raise UsageError("no sources: name at least one file, glob or map directory")
-    return listed
+    return [found[path] for path in sorted(found)]
 
 
-def _examine(path: str, options: dict[str, Any]) -> Source:
+def _examine(path: str, options: dict[str, Any], crs: str | None) -> Source:
     """Open a source as far as its header; a failure is its reason, not an exception."""
-    path = str(Path(path).absolute())
     stat = Path(path).stat()
-    known = Source(path, hash_of(stat.st_size, stat.st_mtime_ns, repr(sorted(options.items()))))
+    readable = tuple(sorted(options.items()))
+    known = Source(path, hash_of(stat.st_size, stat.st_mtime_ns, repr(readable)), options=readable)
     try:
         source = open_source(path, **options)
-        return replace(known, info=source.info(), spans=tuple(source.spans(POINTS_PER_TASK)))
+        info = source.info()
+        spans = tuple(source.spans(POINTS_PER_TASK))
     except (SourceError, OSError) as error:
         return replace(known, reason=str(error))
+    return replace(known, info=replace(info, crs=info.crs or crs), spans=spans)
 
 
 def _with_crs(settings: IngestSettings, found: Sequence[Source]) -> IngestSettings:
@@ -229,11 +267,9 @@ def _is_current(store: TileStore, found: Sequence[Source]) -> bool:
     )
 
 
-def _plan_reading(
-    store: TileStore, found: Sequence[Source], memory: int, options: dict[str, Any]
-) -> Plan:
-    readable = [(s.info, s.spans, s.state) for s in found if s.info is not None]
-    return plan_scatter(store.url, readable, store.settings.tile_size, memory, options)
+def _plan_reading(store: TileStore, found: Sequence[Source], memory: int) -> Plan:
+    readable = [(s.info, s.spans, s.state, s.options) for s in found if s.info is not None]
+    return plan_scatter(store.url, readable, store.settings.tile_size, memory)
 
 
 def _sort_out(
@@ -271,7 +307,8 @@ def _drop_tiles_without_points(store: TileStore, merges: Plan) -> None:
 def _close(
     store: TileStore, found: Sequence[Source], merges: Plan, outcomes: Sequence[Outcome]
 ) -> None:
-    """Record what the map was made from and what failed; remove the fragments."""
+    """Remove the fragments (first, since a full disk may need the room); record what was made."""
+    store.remove_fragments()
     for task, outcome in zip(merges.tasks, outcomes, strict=True):
         assert isinstance(task, MergeTask)
         if not outcome.ok:
@@ -293,7 +330,6 @@ def _close(
             for source in found
         ]
     )
-    store.remove_fragments()
 
 
 def _raise_failures(store: TileStore, found: Sequence[Source], outcomes: Sequence[Outcome]) -> None:

@@ -66,7 +66,7 @@ class ScatterTask:
     """Hash of what the fragment is made from."""
     promised_bytes: int
     options: tuple[tuple[str, object], ...] = ()
-    """How the source is to be read, as keyword and value."""
+    """What the source is opened with, as keyword and value."""
     needs: tuple[str, ...] = ()
     stage: str = "scatter"
 
@@ -138,25 +138,24 @@ def megabytes(count: int) -> str:
 
 def plan_scatter(
     store_url: str,
-    sources: Iterable[tuple[SourceInfo, Sequence[Span], str]],
+    sources: Iterable[tuple[SourceInfo, Sequence[Span], str, tuple[tuple[str, object], ...]]],
     tile_size: float,
     memory: int,
-    options: dict[str, object],
 ) -> Plan:
     """The reading half of an ingest: one task per span of a source.
 
     Args:
         store_url: the store.
-        sources: each source's info, its spans, and the hash of its state on disk.
+        sources: each source's info, its spans, the hash of its state on disk, and the options it
+            is opened with.
         tile_size: edge of a tile [m].
         memory: what a task may use [bytes].
-        options: how sources are to be read.
 
     Raises:
         PlanError: a source that only opens whole does not fit the memory.
     """
     tasks: list[ScatterTask] = []
-    for number, (info, spans, state) in enumerate(sources):
+    for number, (info, spans, state, options) in enumerate(sources):
         free = memory - BASE_BYTES - info.resident_bytes
         block = max(MIN_BLOCK_POINTS, min(MAX_BLOCK_POINTS, free // BYTES_PER_BLOCK_POINT))
         promise = BASE_BYTES + info.resident_bytes + block * BYTES_PER_BLOCK_POINT
@@ -169,7 +168,7 @@ def plan_scatter(
                 block_points=block,
                 identity=hash_of(info.path, state, span.start, span.stop, tile_size),
                 promised_bytes=promise,
-                options=tuple(sorted(options.items())),
+                options=options,
             )
             for span in spans
         ]

@@ -1,0 +1,447 @@
+"""Ingest: the same tiles from any blocks, workers and interruptions; bad input is named."""
+
+import hashlib
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import distributed
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import tilestream as ts
+from tilestream.config import IngestSettings
+from tilestream.dataflow import jobs, plan
+from tilestream.errors import (
+    CrsError,
+    PartialError,
+    PlanError,
+    SourceError,
+    SourceNotFoundError,
+    UsageError,
+)
+from tilestream.formats.las import write_las
+from tilestream.formats.pcd import write_pcd
+from tilestream.store import POINTS
+
+
+def stored_points(store: ts.TileStore) -> np.ndarray:
+    return np.concatenate([store.tile(key).points_mm() for key in store.keys()])
+
+
+def as_set(points: np.ndarray) -> list[tuple[float, ...]]:
+    return sorted(map(tuple, points.tolist()))
+
+
+def tree_digest(folder: str | Path) -> dict[str, str]:
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(Path(folder).rglob("*"))
+        if path.is_file()
+    }
+
+
+def literal_thinning(points: np.ndarray, leaf: int) -> list[tuple[int, ...]]:
+    """definitions, section 1, map points: read word by word, with Python's exact integers."""
+    voxels: dict[tuple[int, ...], list[list[int]]] = {}
+    for point in np.rint(points * 1000.0).astype(int).tolist():
+        voxels.setdefault(tuple(c // leaf for c in point), []).append(point)
+    found = []
+    for members in voxels.values():
+        sums = [sum(column) for column in zip(*members, strict=True)]
+        found.append(tuple(half_even(total, len(members)) for total in sums))
+    return sorted(found)
+
+
+def half_even(total: int, count: int) -> int:
+    low = total // count
+    rest = 2 * (total - low * count)
+    return low + (rest > count or (rest == count and low % 2 == 1))
+
+
+@pytest.fixture(scope="module")
+def clouds(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """A map in three overlapping files, far from the origin."""
+    folder = tmp_path_factory.mktemp("clouds")
+    rng = np.random.default_rng(11)
+    paths = []
+    for number in range(3):
+        lo = np.array([368_000.0 + 20.0 * number, 3_955_000.0, -3.0])
+        path = folder / f"{number}.pcd"
+        write_pcd(path, rng.uniform(lo, lo + np.array([35.0, 40.0, 12.0]), (40_000, 3)))
+        paths.append(path)
+    return paths
+
+
+@pytest.fixture(scope="module")
+def reference(clouds: list[Path], tmp_path_factory: pytest.TempPathFactory) -> ts.TileStore:
+    url = tmp_path_factory.mktemp("reference") / "map.zarr"
+    return ts.ingest(clouds, url, tile_size=10.0, map_leaf=0.5)
+
+
+@settings(
+    max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    tile=st.sampled_from([2.0, 5.0, 12.5, 100.0]),
+    leaf=st.sampled_from([0.0, 0.1, 0.25, 0.5]),
+    block=st.sampled_from([17, 100, 1000]),
+    span=st.sampled_from([50, 333, 5000]),
+    seed=st.integers(0, 3),
+)
+def test_any_tile_and_block_size_stores_the_points_of_the_definition(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    tile: float,
+    leaf: float,
+    block: int,
+    span: int,
+    seed: int,
+) -> None:
+    rng = np.random.default_rng(seed)
+    cloud = rng.normal(0.0, 4.0, (800, 3))
+    write_pcd(tmp_path / "a.pcd", cloud[:500])
+    write_pcd(tmp_path / "b.pcd", cloud[500:])
+    monkeypatch.setattr(plan, "MAX_BLOCK_POINTS", block)
+    monkeypatch.setattr(plan, "MIN_BLOCK_POINTS", block)
+    monkeypatch.setattr(jobs, "POINTS_PER_TASK", span)
+    url = tmp_path / "map.zarr"
+    shutil.rmtree(url, ignore_errors=True)
+    store = ts.ingest([tmp_path / "b.pcd", tmp_path / "a.pcd"], url, tile_size=tile, map_leaf=leaf)
+    mm = np.rint(cloud * 1000.0).astype(np.int64)
+    expected = literal_thinning(cloud, round(leaf * 1000)) if leaf else as_set(mm)
+    assert as_set(stored_points(store)) == expected
+    assert not (url / "fragments").exists()
+
+
+def test_strips_change_nothing(
+    clouds: list[Path], reference: ts.TileStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(plan, "MAX_BLOCK_POINTS", 20_000)
+    monkeypatch.setattr(plan, "BASE_BYTES", 3_950_000)
+    store = ts.ingest(clouds, tmp_path / "map.zarr", tile_size=10.0, map_leaf=0.5, memory=9_000_000)
+    merges = plan.plan_merge("", [], 10.0, 0.5, 10**9)
+    assert merges.tasks == ()
+    assert store.marks() == reference.marks()
+    for key in store.keys():
+        np.testing.assert_array_equal(store.tile(key).points(), reference.tile(key).points())
+
+
+@given(
+    st.lists(st.tuples(*[st.floats(-1.0, 1.0, allow_subnormal=False)] * 3), min_size=1, max_size=30)
+)
+@settings(
+    max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+def test_the_round_trip_errs_by_half_a_millimetre_at_most(
+    tmp_path: Path, offsets: list[tuple[float, float, float]]
+) -> None:
+    cloud = np.array([4_000_000.0, -4_000_000.0, 300.0]) + np.array(offsets)
+    write_pcd(tmp_path / "far.pcd", cloud)
+    shutil.rmtree(tmp_path / "map.zarr", ignore_errors=True)
+    store = ts.ingest(tmp_path / "far.pcd", tmp_path / "map.zarr", tile_size=2.0, map_leaf=0.0)
+    stored = np.concatenate([store.tile(key).points() for key in store.keys()])
+    distance = np.abs(stored[:, None] - cloud[None]).max(axis=2)
+    assert len(stored) == len(cloud)
+    assert distance.min(axis=1).max() <= 0.5e-3 + 1e-9
+    assert distance.min(axis=0).max() <= 0.5e-3 + 1e-9
+
+
+def test_dask_workers_write_the_same_bytes(
+    clouds: list[Path], reference: ts.TileStore, tmp_path: Path
+) -> None:
+    url = tmp_path / "map.zarr"
+    with (
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        ts.ingest(clouds, url, tile_size=10.0, map_leaf=0.5, client=client)
+    assert tree_digest(url) == tree_digest(reference.url)
+
+
+def test_a_killed_worker_is_made_up_for(
+    clouds: list[Path], reference: ts.TileStore, tmp_path: Path
+) -> None:
+    url = tmp_path / "map.zarr"
+    with (
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        victim = next(iter(client.run(os.getpid).values()))
+        seen: list[str] = []
+
+        def watch(outcome: object, ended: int, total: int) -> None:
+            seen.append("")
+            if len(seen) == 8:
+                os.kill(victim, signal.SIGKILL)
+
+        ts.ingest(clouds, url, tile_size=10.0, map_leaf=0.5, client=client, watch=watch)
+    assert tree_digest(url) == tree_digest(reference.url)
+
+
+@pytest.mark.parametrize("tiles_before_the_kill", [0, 5])
+def test_a_killed_ingest_continues_to_the_same_bytes(
+    clouds: list[Path], tmp_path: Path, tiles_before_the_kill: int
+) -> None:
+    arguments = ["--tile-size", "4", "--map-leaf", "0.1"]
+    command = [sys.executable, "-m", "tilestream", "ingest", *map(str, clouds), *arguments]
+    whole, broken = tmp_path / "whole.zarr", tmp_path / "broken.zarr"
+    subprocess.run([*command, "--store", str(whole)], check=True, capture_output=True)
+    process = subprocess.Popen(
+        [*command, "--store", str(broken)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    pattern = "fragments/*" if not tiles_before_the_kill else f"*/{POINTS}/zarr.json"
+    end = time.monotonic() + 60.0
+    while len(list(broken.glob(pattern))) <= tiles_before_the_kill:
+        assert time.monotonic() < end
+        assert process.poll() is None, "it ended before it could be killed"
+        time.sleep(0.002)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert (broken / "fragments").exists()
+    assert tree_digest(broken) != tree_digest(whole)
+    subprocess.run([*command, "--store", str(broken)], check=True, capture_output=True)
+    assert tree_digest(broken) == tree_digest(whole)
+
+
+def test_a_full_disk_is_named_and_the_rest_resumes(clouds: list[Path], tmp_path: Path) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    command = (
+        f"mount -t tmpfs -o size=300k tmpfs {disk} || exit 77; "
+        f"{sys.executable} -m tilestream ingest {clouds[0]} --store {disk}/map.zarr"
+    )
+    shell = ["unshare", "-rm", "sh", "-c", command]
+    if shutil.which("unshare") is None:
+        pytest.skip("no unshare here: cannot make a small disk")
+    ended = subprocess.run(shell, capture_output=True, text=True, check=False)
+    if ended.returncode not in (0, 1, 2) or "unshare" in ended.stderr:
+        pytest.skip(f"cannot mount a small disk here: {ended.stderr.strip()}")
+    assert ended.returncode == 1
+    assert "No space left on device" in ended.stderr
+    assert "0.pcd" in ended.stderr
+    assert "Traceback" not in ended.stderr
+
+
+def test_an_unchanged_map_is_not_read_again(clouds: list[Path], reference: ts.TileStore) -> None:
+    before = tree_digest(reference.url)
+    seen: list[object] = []
+    ts.ingest(
+        clouds,
+        reference.url,
+        tile_size=10.0,
+        map_leaf=0.5,
+        watch=lambda *what: seen.append(what),
+    )
+    assert seen == []
+    assert tree_digest(reference.url) == before
+
+
+def written_at(store: ts.TileStore) -> dict[ts.TileKey, int]:
+    marks = {key: Path(store.url) / str(key) / POINTS / "zarr.json" for key in store.keys()}
+    return {key: path.stat().st_mtime_ns for key, path in marks.items()}
+
+
+def test_a_changed_source_redoes_its_tiles_only(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    near, far = rng.uniform(0.0, 30.0, (500, 3)), rng.uniform(100.0, 130.0, (500, 3))
+    write_pcd(tmp_path / "near.pcd", near)
+    write_pcd(tmp_path / "far.pcd", far)
+    sources, url = [tmp_path / "near.pcd", tmp_path / "far.pcd"], tmp_path / "map.zarr"
+    store = ts.ingest(sources, url, tile_size=10.0)
+    times = written_at(store)
+    write_pcd(tmp_path / "far.pcd", far[far[:, 0] < 120.0] + (0.0, 0.0, 0.01))
+    store = ts.ingest(sources, url, tile_size=10.0)
+    after = written_at(store)
+    assert {key for key in times if after.get(key) == times[key]} == {k for k in times if k[0] < 10}
+    assert {key for key in times if key not in after} == {k for k in times if k[0] == 12}
+    fresh = ts.ingest(sources, tmp_path / "fresh.zarr", tile_size=10.0)
+    assert tree_digest(url) == tree_digest(fresh.url)
+
+
+def test_a_forgotten_source_and_another_setting_are_refused(
+    clouds: list[Path], reference: ts.TileStore
+) -> None:
+    with pytest.raises(UsageError, match=r"also made from .*2\.pcd"):
+        ts.ingest(clouds[:2], reference.url, tile_size=10.0, map_leaf=0.5)
+    with pytest.raises(UsageError, match=r"has tile_size 10\.0, asked for is 20\.0"):
+        ts.ingest(clouds, reference.url, tile_size=20.0, map_leaf=0.5)
+
+
+def test_points_that_are_not_finite_are_dropped_and_counted(tmp_path: Path) -> None:
+    cloud = np.arange(30.0).reshape(10, 3)
+    cloud[3, 1], cloud[7, 0], cloud[8] = np.nan, np.inf, -np.inf
+    write_pcd(tmp_path / "gaps.pcd", cloud)
+    store = ts.ingest(tmp_path / "gaps.pcd", tmp_path / "map.zarr")
+    assert len(stored_points(store)) == 7
+    (source,) = store.sources()
+    assert (source["points"], source["dropped"]) == (7, 3)
+
+
+def test_sources_without_points_are_an_error_that_names_them(tmp_path: Path) -> None:
+    write_pcd(tmp_path / "empty.pcd", np.zeros((0, 3)))
+    with pytest.raises(SourceError, match=r"hold no points: .*empty\.pcd"):
+        ts.ingest(tmp_path / "empty.pcd", tmp_path / "map.zarr")
+    assert ts.open_store(str(tmp_path / "map.zarr")).keys() == []
+
+
+def test_the_good_sources_are_ingested_and_the_bad_one_leaves_nothing(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    good, bad = tmp_path / "good.pcd", tmp_path / "bad.pcd"
+    write_pcd(good, rng.uniform(0.0, 20.0, (1000, 3)))
+    write_pcd(bad, rng.uniform(0.0, 20.0, (1000, 3)))
+    whole = bad.read_bytes()
+    bad.write_bytes(whole[:-100])
+    url = tmp_path / "map.zarr"
+    with pytest.raises(PartialError, match=r"1 sources or tiles failed.*\n.*bad\.pcd") as caught:
+        ts.ingest([good, bad], url, tile_size=10.0)
+    assert list(caught.value.failures) == [str(bad)]
+    alone = ts.ingest(good, tmp_path / "alone.zarr", tile_size=10.0)
+    assert ts.open_store(str(url)).marks() == alone.marks()
+    bad.write_bytes(whole)
+    both = ts.ingest([good, bad], url, tile_size=10.0)
+    fresh = ts.ingest([good, bad], tmp_path / "fresh.zarr", tile_size=10.0)
+    assert tree_digest(both.url) == tree_digest(fresh.url)
+
+
+@pytest.mark.parametrize("place", [(2e8, 0.0, 0.0), (0.0, -2e8, 0.0), (0.0, 0.0, 2e6)])
+def test_coordinates_that_do_not_fit_the_grid_are_named(
+    tmp_path: Path, place: tuple[float, float, float]
+) -> None:
+    write_pcd(tmp_path / "stray.pcd", np.array([[0.0, 0.0, 0.0], place]))
+    with pytest.raises(PartialError, match=r"stray\.pcd.*does not fit the tile grid"):
+        ts.ingest(tmp_path / "stray.pcd", tmp_path / "map.zarr")
+
+
+def test_a_stray_point_does_not_take_all_memory(tmp_path: Path) -> None:
+    write_pcd(tmp_path / "stray.pcd", np.array([[0.0, 0.0, 0.0], [9e7, 9e7, 0.0]]))
+    with pytest.raises(PartialError, match=r"spans .* tiles"):
+        ts.ingest(tmp_path / "stray.pcd", tmp_path / "map.zarr", tile_size=1.0)
+
+
+def test_two_crs_are_refused_before_anything_is_written(tmp_path: Path) -> None:
+    cloud = np.zeros((10, 3))
+    write_las(tmp_path / "a.las", cloud, crs="EPSG:6677")
+    write_las(tmp_path / "b.las", cloud, crs="EPSG:32654")
+    with pytest.raises(CrsError, match=r"(?s)a\.las is .*b\.las is "):
+        ts.ingest([tmp_path / "a.las", tmp_path / "b.las"], tmp_path / "map.zarr")
+    with pytest.raises(CrsError, match="asked for"):
+        ts.ingest(tmp_path / "a.las", tmp_path / "map.zarr", crs="EPSG:32654")
+    with pytest.raises(CrsError, match="no CRS that pyproj reads"):
+        ts.ingest(tmp_path / "a.las", tmp_path / "map.zarr", crs="EPSG:nonsense")
+    assert not (tmp_path / "map.zarr").exists()
+    store = ts.ingest([tmp_path / "a.las"], tmp_path / "map.zarr")
+    assert "6677" in str(store.settings.crs)
+
+
+def test_what_cannot_be_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    write_pcd(tmp_path / "a.pcd", np.zeros((10, 3)))
+    url = tmp_path / "map.zarr"
+    for bad in (
+        {"tile_size": 0.0},
+        {"tile_size": float("nan")},
+        {"tile_size": 10.0, "map_leaf": 0.3},
+        {"map_leaf": -1.0},
+        {"halo": -1.0},
+    ):
+        with pytest.raises(UsageError):
+            ts.ingest(tmp_path / "a.pcd", url, **bad)
+    with pytest.raises(SourceNotFoundError, match="nothing"):
+        ts.ingest([tmp_path / "a.pcd", tmp_path / "nothing*.pcd"], url)
+    with pytest.raises(UsageError, match="no sources"):
+        ts.ingest([], url)
+    assert not url.exists()
+
+
+def test_a_job_that_does_not_fit_its_memory_is_refused_with_advice(clouds: list[Path]) -> None:
+    with pytest.raises(PlanError, match="--memory"):
+        jobs.plan_ingest(clouds, "map.zarr", IngestSettings(), memory=10_000_000)
+    made = jobs.plan_ingest(clouds, "map.zarr", IngestSettings())
+    assert list(made.describe()) == [("scatter", 3, made.promised_bytes)]
+    assert made.promised_bytes <= plan.DEFAULT_MEMORY
+
+
+def test_two_ingests_at_once_into_two_stores_do_not_meet(
+    clouds: list[Path], reference: ts.TileStore, tmp_path: Path
+) -> None:
+    def work(name: str) -> None:
+        ts.ingest(clouds, tmp_path / name, tile_size=10.0, map_leaf=0.5)
+
+    threads = [threading.Thread(target=work, args=(f"{n}.zarr",)) for n in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for number in range(2):
+        assert tree_digest(tmp_path / f"{number}.zarr") == tree_digest(reference.url)
+
+
+@pytest.mark.parametrize(
+    "name", ["hdl64_street.pcd", "vls128_street.pcd", "251370668.pcd", "251371071.pcd"]
+)
+def test_real_scans_ingest_with_the_right_counts(
+    shared_data: Path, tmp_path: Path, name: str
+) -> None:
+    (path,) = shared_data.glob(f"*/{name}")
+    raw = path.read_bytes()
+    head, body = raw.split(b"DATA binary\n", 1)
+    header = dict(line.split(maxsplit=1) for line in head.decode().splitlines()[1:])
+    width = len(header["FIELDS"].split())
+    cloud = np.frombuffer(body, np.float32, int(header["POINTS"]) * width).reshape(-1, width)
+    finite = cloud[np.isfinite(cloud[:, :3]).all(axis=1), :3].astype(np.float64)
+    store = ts.ingest(path, tmp_path / "map.zarr", map_leaf=0.0)
+    stored = stored_points(store)
+    assert len(stored) == len(finite)
+    mm = np.rint(finite * 1000.0)
+    np.testing.assert_array_equal(stored.min(axis=0), mm.min(axis=0))
+    np.testing.assert_array_equal(stored.max(axis=0), mm.max(axis=0))
+    np.testing.assert_array_equal(stored.sum(axis=0), mm.sum(axis=0))
+
+
+MEMORY_PROBE = """
+import resource, sys
+from tilestream.cli import run
+code = run(sys.argv[1:])
+print("PEAK", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+sys.exit(code)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("leaf", ["0.2", "0"])
+def test_a_source_far_larger_than_the_promise_ingests_within_it(tmp_path: Path, leaf: str) -> None:
+    points, chunk = 170_000_000, 5_000_000
+    header = (
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\n"
+        f"TYPE F F F\nCOUNT 1 1 1\nWIDTH {points}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\n"
+        f"POINTS {points}\nDATA binary\n"
+    )
+    rng = np.random.default_rng(0)
+    with (tmp_path / "large.pcd").open("wb") as file:
+        file.write(header.encode())
+        for _ in range(points // chunk):
+            file.write(rng.uniform(0.0, (1500.0, 1500.0, 5.0), (chunk, 3)).astype("<f4").tobytes())
+    assert (tmp_path / "large.pcd").stat().st_size > 2e9
+    ended = subprocess.run(
+        [
+            *(sys.executable, "-c", MEMORY_PROBE, "ingest", str(tmp_path / "large.pcd")),
+            *("--store", str(tmp_path / "map.zarr"), "--memory", "512MB", "--map-leaf", leaf),
+        ],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    peak = int(ended.stdout.rsplit("PEAK", 1)[1])
+    print(f"peak {peak / 1e6:.0f} MB of 512 MB promised")  # noqa: T201
+    assert peak <= 512e6
