@@ -1,6 +1,7 @@
 """Ingest: the same tiles from any blocks, workers and interruptions; bad input is named."""
 
 import hashlib
+import importlib
 import os
 import shutil
 import signal
@@ -18,7 +19,7 @@ from hypothesis import strategies as st
 
 import tilestream as ts
 from tilestream.config import IngestSettings
-from tilestream.dataflow import jobs, plan
+from tilestream.dataflow import ingest_map, ingest_tasks, plan
 from tilestream.errors import (
     CrsError,
     PartialError,
@@ -109,9 +110,9 @@ def test_any_tile_and_block_size_stores_the_points_of_the_definition(
     cloud = rng.normal(0.0, 4.0, (800, 3))
     write_pcd(tmp_path / "a.pcd", cloud[:500])
     write_pcd(tmp_path / "b.pcd", cloud[500:])
-    monkeypatch.setattr(plan, "MAX_BLOCK_POINTS", block)
-    monkeypatch.setattr(plan, "MIN_BLOCK_POINTS", block)
-    monkeypatch.setattr(jobs, "POINTS_PER_TASK", span)
+    monkeypatch.setattr(ingest_tasks, "MAX_BLOCK_POINTS", block)
+    monkeypatch.setattr(ingest_tasks, "MIN_BLOCK_POINTS", block)
+    monkeypatch.setattr(ingest_map, "POINTS_PER_TASK", span)
     url = tmp_path / "map.zarr"
     shutil.rmtree(url, ignore_errors=True)
     store = ts.ingest([tmp_path / "b.pcd", tmp_path / "a.pcd"], url, tile_size=tile, map_leaf=leaf)
@@ -124,11 +125,14 @@ def test_any_tile_and_block_size_stores_the_points_of_the_definition(
 def test_strips_change_nothing(
     clouds: list[Path], reference: ts.TileStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(plan, "MAX_BLOCK_POINTS", 20_000)
-    monkeypatch.setattr(plan, "BASE_BYTES", 3_950_000)
+    strips: list[object] = []
+    module = importlib.import_module("tilestream.ingest")  # ts.ingest is the function
+    thin = module.thin
+    monkeypatch.setattr(module, "thin", lambda *what: strips.append(what) or thin(*what))
+    monkeypatch.setattr(ingest_tasks, "MAX_BLOCK_POINTS", 20_000)
+    monkeypatch.setattr(ingest_tasks, "BASE_BYTES", 3_950_000)
     store = ts.ingest(clouds, tmp_path / "map.zarr", tile_size=10.0, map_leaf=0.5, memory=9_000_000)
-    merges = plan.plan_merge("", [], 10.0, 0.5, 10**9)
-    assert merges.tasks == ()
+    assert len(strips) > len(store.keys())
     assert store.marks() == reference.marks()
     for key in store.keys():
         np.testing.assert_array_equal(store.tile(key).points(), reference.tile(key).points())
@@ -366,8 +370,8 @@ def test_what_cannot_be_is_refused_before_anything_is_written(tmp_path: Path) ->
 
 def test_a_job_that_does_not_fit_its_memory_is_refused_with_advice(clouds: list[Path]) -> None:
     with pytest.raises(PlanError, match="--memory"):
-        jobs.plan_ingest(clouds, "map.zarr", IngestSettings(), memory=10_000_000)
-    made = jobs.plan_ingest(clouds, "map.zarr", IngestSettings())
+        ingest_map.plan_ingest(clouds, "map.zarr", IngestSettings(), memory=10_000_000)
+    made = ingest_map.plan_ingest(clouds, "map.zarr", IngestSettings())
     assert list(made.describe()) == [("scatter", 3, made.promised_bytes)]
     assert made.promised_bytes <= plan.DEFAULT_MEMORY
 

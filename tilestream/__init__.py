@@ -6,7 +6,7 @@ scans -> 317 registrations each -------> error per sample point -----+-> forest 
 ```
 """
 
-from tilestream.dataflow.jobs import ingest as ingest
+from tilestream.dataflow.ingest_map import ingest as ingest
 from tilestream.records import Cells as Cells
 from tilestream.sensors import HDL64 as HDL64
 from tilestream.sensors import OS1_128 as OS1_128

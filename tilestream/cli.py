@@ -27,7 +27,7 @@ from rich.progress import (
 from rich.table import Table
 
 from tilestream.config import IngestSettings
-from tilestream.dataflow import jobs
+from tilestream.dataflow import ingest_map
 from tilestream.dataflow.plan import DEFAULT_MEMORY, Plan, megabytes
 from tilestream.dataflow.run import Watch, dask_client
 from tilestream.dataflow.tasks import Outcome
@@ -185,13 +185,15 @@ def ingest(
     allowed = parse_bytes(memory)
     scans = ScanSelection(every=every, offset=offset, from_s=from_s, until_s=until_s)
     if dry_run:
-        plan = jobs.plan_ingest(sources, store, settings, allowed, points_topic, pose_topic, scans)
+        plan = ingest_map.plan_ingest(
+            sources, store, settings, allowed, points_topic, pose_topic, scans
+        )
         out.print(plan_table(plan))
         return
     failed: PartialError | None = None
     with dask_client(scheduler, workers, allowed) as client, progress() as watch:
         try:
-            jobs.ingest(
+            ingest_map.ingest(
                 sources,
                 store,
                 **settings.model_dump(),
@@ -277,7 +279,7 @@ def demo(
         resources.as_file(resources.files("tilestream") / "data" / "street.laz") as cloud,
         progress() as watch,
     ):
-        made = jobs.ingest(cloud, place, tile_size=20.0, watch=watch)
+        made = ingest_map.ingest(cloud, place, tile_size=20.0, watch=watch)
     out.print(tile_table(made))
     out.print(f"The tile store is at {place}", highlight=False, soft_wrap=True)
 

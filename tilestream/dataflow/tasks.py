@@ -1,15 +1,15 @@
-"""Each stage's body: open the store, call the pure function, return a small summary."""
+"""How a task is performed, whatever its stage, and what became of it.
+
+The body of each stage registers itself beside its task's type, in the file of its job.
+"""
 
 import time
 import traceback
 from dataclasses import dataclass
 from functools import singledispatch
 
-from tilestream import ingest
-from tilestream.dataflow.plan import MergeTask, ScatterTask, Task
+from tilestream.dataflow.plan import Task
 from tilestream.errors import TaskError, TilestreamError
-from tilestream.ingest import Fragment
-from tilestream.store import Mark, open_store
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Outcome:
     """The task's key."""
     stage: str
     """The task's stage."""
-    result: Fragment | Mark | None
+    result: object
     """Its small summary; None where it failed."""
     reason: str = ""
     """Why it failed; empty where it did not."""
@@ -36,28 +36,9 @@ class Outcome:
 
 
 @singledispatch
-def perform(task: Task) -> Fragment | Mark:
+def perform(task: Task) -> object:
     """Do the work of a task; what it raises is its failure."""
     raise TaskError(f"{task.key}: no body for tasks of type {type(task).__name__}")
-
-
-@perform.register
-def _scatter(task: ScatterTask) -> Fragment:
-    return ingest.scatter(
-        open_store(task.store_url),
-        task.name,
-        task.source,
-        task.span,
-        task.block_points,
-        task.identity,
-        dict(task.options),
-    )
-
-
-@perform.register
-def _merge(task: MergeTask) -> Mark:
-    store = open_store(task.store_url)
-    return ingest.merge(store, task.tile, task.pieces, task.mark, task.strips, task.batch)
 
 
 def attempt(task: Task) -> Outcome:

@@ -1,4 +1,4 @@
-"""The jobs a user runs, each a story of a few steps over plan and run."""
+"""The job that makes a map: sources in, tile store out, in ten steps over plan and run."""
 
 import os
 from collections.abc import Iterable, Sequence
@@ -10,14 +10,8 @@ import pyproj
 import pyproj.exceptions
 
 from tilestream.config import IngestSettings
-from tilestream.dataflow.plan import (
-    DEFAULT_MEMORY,
-    MergeTask,
-    Plan,
-    ScatterTask,
-    plan_merge,
-    plan_scatter,
-)
+from tilestream.dataflow.ingest_tasks import MergeTask, ScatterTask, plan_merge, plan_scatter
+from tilestream.dataflow.plan import DEFAULT_MEMORY, Plan
 from tilestream.dataflow.run import Watch, execute
 from tilestream.dataflow.tasks import Outcome
 from tilestream.errors import (
