@@ -15,7 +15,7 @@ FLOORS = (
     ("kernels", "sensors"),
     ("records",),
     ("ndt",),
-    ("store", "formats", "simulation"),
+    ("store", "tables", "formats", "simulation"),
     ("localization", "factors", "forest"),
     ("report", "ingest"),
     ("dataflow",),

@@ -131,6 +131,7 @@ def test_strips_change_nothing(
     monkeypatch.setattr(module, "thin", lambda *what: strips.append(what) or thin(*what))
     monkeypatch.setattr(ingest_tasks, "MAX_BLOCK_POINTS", 20_000)
     monkeypatch.setattr(ingest_tasks, "BASE_BYTES", 3_950_000)
+    monkeypatch.setattr(ingest_tasks, "BYTES_PER_TILE_POINT", 10_000)
     store = ts.ingest(clouds, tmp_path / "map.zarr", tile_size=10.0, map_leaf=0.5, memory=9_000_000)
     assert len(strips) > len(store.keys())
     assert store.marks() == reference.marks()

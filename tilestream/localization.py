@@ -6,6 +6,7 @@ the label of a place is what 317 starts around the true pose end with.
 
 import logging
 import math
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -179,39 +180,65 @@ def localization_error(
     T_map_true = _rigid(T_map_lidar, "the true pose")[0]
     T_map_lidar_starts = _starts(T_map_true, starts, start_settings)
     found = register(cells, scan_points, T_map_lidar_starts, settings)
-    heading = math.atan2(T_map_true[1, 0], T_map_true[0, 0])
-    forward = np.array([math.cos(heading), math.sin(heading)])
-    offset = found.T_map_lidar[:, :3, 3] - T_map_true[:3, 3]
-    along = offset[:, :2] @ forward
-    across = offset[:, 1] * forward[0] - offset[:, 0] * forward[1]
-    turned = np.arctan2(found.T_map_lidar[:, 1, 0], found.T_map_lidar[:, 0, 0]) - heading
-    yaw = (turned + np.pi) % (2.0 * np.pi) - np.pi
-    error = np.sqrt((offset**2).sum(axis=1))
+    errors = start_errors(T_map_true, found.T_map_lidar)
     distance = np.linalg.norm(T_map_lidar_starts[:, :3, 3] - T_map_true[:3, 3], axis=1)
-    held = error[error <= FAILED]
-    error_floor = _mean(error[distance <= NEAR + 1e-9])
     return LocalizationError(
         T_map_lidar=T_map_true,
         true_pose=true_pose,
         T_map_lidar_starts=T_map_lidar_starts,
         registrations=found,
-        along=along,
-        across=across,
-        up=offset[:, 2],
-        yaw=yaw,
-        error=error,
-        error_mean=_mean(error),
-        p_fail=_mean(error > FAILED),
-        mean_held=_mean(held),
-        median_held=float(np.median(held)) if held.size else math.nan,
-        p95_held=float(np.percentile(held, 95.0)) if held.size else math.nan,
-        along_mean=_mean(np.abs(along)),
-        across_mean=_mean(np.abs(across)),
-        up_mean=_mean(np.abs(offset[:, 2])),
-        yaw_mean=_mean(np.abs(yaw)),
-        error_floor=error_floor,
-        error_tail=_mean(error) - error_floor,
+        **errors,
+        **summary(errors, distance),
     )
+
+
+def start_errors(T_map_true: Float64, T_map_final: Float64) -> dict[str, Float64]:
+    """The error of each start, in the frame of the true heading.
+
+    Args:
+        T_map_true: (4, 4) true pose.
+        T_map_final: (k, 4, 4) where the starts ended.
+
+    Returns:
+        (k,) each: `along`, `across`, `up` [m], `yaw` [rad], `error` (the 3D norm) [m], as the
+        fields of `LocalizationError` say.
+    """
+    heading = math.atan2(T_map_true[1, 0], T_map_true[0, 0])
+    forward = np.array([math.cos(heading), math.sin(heading)])
+    offset = T_map_final[:, :3, 3] - T_map_true[:3, 3]
+    turned = np.arctan2(T_map_final[:, 1, 0], T_map_final[:, 0, 0]) - heading
+    return {
+        "along": offset[:, :2] @ forward,
+        "across": offset[:, 1] * forward[0] - offset[:, 0] * forward[1],
+        "up": offset[:, 2],
+        "yaw": (turned + np.pi) % (2.0 * np.pi) - np.pi,
+        "error": np.sqrt((offset**2).sum(axis=1)),
+    }
+
+
+def summary(errors: Mapping[str, Float64], distance: Float64) -> dict[str, float]:
+    """The label of a sample point from the errors of its starts.
+
+    Args:
+        errors: as `start_errors` gives them.
+        distance: (k,) of each start from the true position [m].
+
+    Returns:
+        The summary fields of `LocalizationError`, by name; the mean of nothing is NaN.
+    """
+    error = errors["error"]
+    held = error[error <= FAILED]
+    error_floor = _mean(error[distance <= NEAR + 1e-9])
+    return {
+        "error_mean": _mean(error),
+        "p_fail": _mean(error > FAILED),
+        "mean_held": _mean(held),
+        "median_held": float(np.median(held)) if held.size else math.nan,
+        "p95_held": float(np.percentile(held, 95.0)) if held.size else math.nan,
+        **{f"{name}_mean": _mean(np.abs(errors[name])) for name in ("along", "across", "up", "yaw")},
+        "error_floor": error_floor,
+        "error_tail": _mean(error) - error_floor,
+    }
 
 
 def refined_pose(

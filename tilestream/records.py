@@ -197,8 +197,9 @@ def _whole(values: ArrayLike, name: str) -> Int64:
     return np.array(given, np.int64, order="C")
 
 
-Criterion = Literal["FS", "RQ", "LY", "LS"]
-"""Feature sufficiency, representation quality, layout, local similarity (the paper, section V)."""
+Criterion = Literal["FS", "RQ", "LY", "LS", "place", "label"]
+"""Feature sufficiency, representation quality, layout, local similarity (the paper, section V); or
+where a row is; or what was measured there."""
 
 
 @dataclass(frozen=True)

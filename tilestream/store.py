@@ -34,7 +34,7 @@ from tilestream.errors import (
 )
 from tilestream.ndt import cells_of_mm
 from tilestream.records import Cells, Float64, Int64
-from tilestream.tiling import MM_PER_M, TileGrid, TileKey, whole_mm
+from tilestream.tiling import MM_PER_M, Box, TileGrid, TileKey, whole_mm
 from tilestream.version import VERSION
 
 SCHEMA = 1
@@ -366,6 +366,28 @@ class TileStore:
     def tile_at(self, x: float, y: float) -> Tile:
         """The tile whose core holds the place (x, y) [m, map frame]; raises as `tile` does."""
         return self.tile(self.grid.key_at(x, y))
+
+    def cells_in(self, box: Box, cell_size: float) -> Cells:
+        """The NDT cells of all tiles that a box touches, whole tiles, as one map.
+
+        Args:
+            box: where; tiles that the store does not have are empty ground.
+            cell_size: edge of a cell [m].
+
+        Raises:
+            TileNotReadyError: a tile in the box failed or was skipped; says why.
+            UsageError: as `Tile.cells`.
+        """
+        tiles = [Tile(self, key) for key in self.grid.keys_over(box)]
+        parts = [tile.cells(cell_size) for tile in tiles if tile.mark(POINTS).status != "missing"]
+        if not parts:
+            self.grid.require_cell_size(whole_mm(cell_size, "cell_size"))
+            return cells_of_mm(np.zeros((0, 3), np.int64), whole_mm(cell_size, "cell_size"))
+        columns = ("index", "count", "mean", "covariance")
+        return Cells(
+            *(np.concatenate([getattr(part, name) for part in parts]) for name in columns),
+            cell_size=cell_size,
+        )
 
     def __repr__(self) -> str:
         counts = [m.facts["points"] for m in self.marks().values() if m.status == "done"]

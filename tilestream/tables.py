@@ -1,0 +1,89 @@
+"""Tables as Parquet files: every column documented inside, whole or not there, marked as done."""
+
+import io
+import json
+import uuid
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import fsspec
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from tilestream.errors import CorruptSourceError, SourceNotFoundError
+from tilestream.records import Column
+
+_MARK = b"tilestream"
+
+
+def write_table(
+    path: str, frame: pd.DataFrame, columns: Sequence[Column], mark: Mapping[str, Any]
+) -> None:
+    """Write a table in one piece: a file that is there is whole.
+
+    Args:
+        path: where to, a local path or any fsspec URL; a file there is replaced.
+        frame: the rows.
+        columns: what the columns mean; each of the frame's columns must be among them.
+        mark: small JSON facts kept in the file: identity, settings, version.
+    """
+    known = {column.name: column for column in columns}
+    table = pa.Table.from_pandas(frame, preserve_index=False)
+    fields = [
+        field.with_metadata(
+            {
+                "unit": known[field.name].unit,
+                "meaning": known[field.name].meaning,
+                "source": known[field.name].source,
+            }
+        )
+        for field in table.schema
+    ]
+    table = table.cast(pa.schema(fields, {_MARK: json.dumps(mark, sort_keys=True)}))
+    buffer = io.BytesIO()
+    pq.write_table(table, buffer, compression="zstd")
+    fs, place = fsspec.core.url_to_fs(path)
+    fs.makedirs(place.rsplit("/", 1)[0], exist_ok=True)
+    part = f"{place}.{uuid.uuid4().hex}.part"
+    try:
+        fs.pipe_file(part, buffer.getvalue())
+        fs.mv(part, place)
+    except OSError:
+        if fs.exists(part):
+            fs.rm(part)
+        raise
+
+
+def read_mark(path: str) -> dict[str, Any] | None:
+    """The mark of a table; None where there is no whole table at `path`."""
+    fs, place = fsspec.core.url_to_fs(path)
+    try:
+        with fs.open(place, "rb") as file:
+            metadata = pq.read_schema(file).metadata or {}
+    except (FileNotFoundError, pa.ArrowInvalid):
+        return None
+    return dict(json.loads(metadata[_MARK])) if _MARK in metadata else None
+
+
+def read_tables(paths: Sequence[str]) -> pd.DataFrame:
+    """The rows of tables of the same columns, one after the other.
+
+    Raises:
+        SourceNotFoundError: a file is not there, or `paths` is empty.
+        CorruptSourceError: a file is no Parquet table.
+    """
+    if not paths:
+        raise SourceNotFoundError("no tables: the job that writes them has not run here")
+    frames = []
+    for path in paths:
+        fs, place = fsspec.core.url_to_fs(path)
+        try:
+            with fs.open(place, "rb") as file:
+                frames.append(pq.read_table(file).to_pandas())
+        except FileNotFoundError:
+            raise SourceNotFoundError(f"{path}: no such table") from None
+        except pa.ArrowInvalid as error:
+            raise CorruptSourceError(f"{path}: no Parquet table: {error}") from error
+    rows: pd.DataFrame = pd.concat(frames, ignore_index=True)
+    return rows
