@@ -8,12 +8,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import laspy
 import lazrs
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
@@ -46,8 +46,19 @@ _SCALE = 0.001
 _INT32 = np.dtype("<i4")
 _XYZ = (Column(0, _INT32), Column(4, _INT32), Column(8, _INT32))
 """X, Y and Z begin every point, whatever its format."""
-_ONLY_XYZ = laspy.DecompressionSelection.XY_RETURNS_CHANNEL | laspy.DecompressionSelection.Z
+_ONLY_XYZ = lazrs.DecompressionSelection(
+    lazrs.SELECTIVE_DECOMPRESS_XY_RETURNS_CHANNEL | lazrs.SELECTIVE_DECOMPRESS_Z
+)
 """What is decoded of a LAZ point where its format can be decoded in parts (6 to 10)."""
+
+
+@dataclass(frozen=True)
+class _Chunk:
+    """Compressed points that can be unpacked by themselves."""
+
+    span: Span
+    offset: int
+    packed_bytes: int
 
 
 @dataclass(frozen=True)
@@ -58,8 +69,12 @@ class LasSource:
     """The file, as it was named."""
     rows: BinaryRows
     """Layout of the points; where they lie in a file that is not compressed."""
-    chunks: tuple[int, ...]
-    """Points of each chunk of a compressed file, which can be read by itself; else empty."""
+    chunks: tuple[_Chunk, ...]
+    """The pieces of a compressed file; else empty."""
+    packing: bytes
+    """How lazrs is told the compression: the record of LAZ in the file's header; else empty."""
+    dtype: np.dtype[Any]
+    """Type of an unpacked point."""
     summary: SourceInfo
     """What the header tells."""
 
@@ -72,10 +87,10 @@ class LasSource:
         if not self.chunks:
             return even_spans(self.rows.count, points)
         spans, start = [], 0
-        for end in np.minimum(np.cumsum(self.chunks), self.rows.count).tolist():
-            if end > start and (end - start >= points or end == self.rows.count):
-                spans.append(Span(start, end))
-                start = end
+        for stop in (chunk.span.stop for chunk in self.chunks):
+            if stop - start >= points or stop == self.rows.count:
+                spans.append(Span(start, stop))
+                start = stop
         return spans
 
     def blocks(self, span: Span, block_points: int) -> Iterator[Block]:
@@ -86,21 +101,27 @@ class LasSource:
 
     def _unpacked_blocks(self, span: Span, block_points: int) -> Iterator[Block]:
         whole_span(span, self.rows.count, self.path)
-        if span.start == span.stop:
-            return
         with Path(self.path).open("rb") as file:
-            with _laspy_errors(self.path, f"point {span.start}"):
-                reader = laspy.LasReader(
-                    file,
-                    laz_backend=laspy.LazBackend.Lazrs,
-                    read_evlrs=False,
-                    decompression_selection=_ONLY_XYZ,
-                )
-                reader.seek(span.start)
-            for step in steps(span, block_points):
-                with _laspy_errors(self.path, f"points {step.start} to {step.stop - 1}"):
-                    record = reader.read_points(step.stop - step.start).array
-                yield finite_block(record["X"], record["Y"], record["Z"], self.rows.scaling)
+            for chunk in self.chunks:
+                start, stop = max(span.start, chunk.span.start), min(span.stop, chunk.span.stop)
+                if start >= stop:
+                    continue
+                points = self._unpack(file, chunk)
+                for step in steps(Span(start, stop), block_points):
+                    part = points[step.start - chunk.span.start : step.stop - chunk.span.start]
+                    yield finite_block(part["X"], part["Y"], part["Z"], self.rows.scaling)
+
+    def _unpack(self, file: BinaryIO, chunk: _Chunk) -> NDArray[Any]:
+        """A chunk by itself: lazrs' own seek goes astray where chunks differ in size (COPC)."""
+        file.seek(chunk.offset)
+        packed = file.read(chunk.packed_bytes)
+        count = chunk.span.stop - chunk.span.start
+        points = np.zeros(count, self.dtype)
+        with _laspy_errors(self.path, f"points {chunk.span.start} to {chunk.span.stop - 1}"):
+            lazrs.decompress_points_with_chunk_table(
+                packed, self.packing, points.view(np.uint8), [(count, len(packed))], _ONLY_XYZ
+            )
+        return points
 
 
 def open_las(path: str) -> LasSource:
@@ -117,12 +138,15 @@ def open_las(path: str) -> LasSource:
         with _laspy_errors(path, "header"):
             header = laspy.LasHeader.read_from(file, read_evlrs=True)
             dimensions = list(header.point_format.dimensions)
+            dtype = header.point_format.dtype()
         scaling = _scaling(header, path)
         rows = BinaryRows(path, points_at, point_bytes, count, _XYZ, scaling)
         if header.are_points_compressed:
-            chunks = _chunks(file, header, rows, size_bytes)
+            with _laspy_errors(path, "LAZ record"):
+                packing = bytes(header.vlrs[header.vlrs.index("LasZipVlr")].record_data)
+            chunks = _chunks(file, packing, rows, size_bytes)
         else:
-            chunks = ()
+            chunks, packing = (), b""
             rows.check_size(size_bytes)
     crs, notes = _crs(header, path)
     lowest, highest = (
@@ -136,10 +160,12 @@ def open_las(path: str) -> LasSource:
         bounds=(lowest, highest) if count else None,
         fields=tuple((d.name, f"{d.num_bits} bit {d.kind.name}") for d in dimensions),
         crs=crs,
-        resident_bytes=0,
+        resident_bytes=max(
+            (c.packed_bytes + point_bytes * (c.span.stop - c.span.start) for c in chunks), default=0
+        ),
         notes=notes,
     )
-    return LasSource(path, rows, chunks, summary)
+    return LasSource(path, rows, chunks, packing, dtype, summary)
 
 
 @contextmanager
@@ -195,9 +221,9 @@ def _scaling(header: laspy.LasHeader, path: str) -> Scaling:
 
 
 def _chunks(
-    file: BinaryIO, header: laspy.LasHeader, rows: BinaryRows, size_bytes: int
-) -> tuple[int, ...]:
-    """Points of each chunk; the table's claims are checked before lazrs allocates by them."""
+    file: BinaryIO, packing: bytes, rows: BinaryRows, size_bytes: int
+) -> tuple[_Chunk, ...]:
+    """Where each chunk lies; the table's claims are checked before lazrs allocates by them."""
     if not rows.count:
         return ()
     file.seek(rows.offset)
@@ -211,14 +237,14 @@ def _chunks(
             f"at {size_bytes}: it is cut short or damaged"
         )
     file.seek(table_at + 4)
-    chunks = int.from_bytes(file.read(4), "little")
-    if (chunks - 1) * rows.size > table_at - rows.offset - 8:  # each begins with a whole point
+    claimed = int.from_bytes(file.read(4), "little")
+    if (claimed - 1) * rows.size > table_at - rows.offset - 8:  # each begins with a whole point
         raise CorruptSourceError(
-            f"{rows.path}: claims {chunks} chunks at offset {table_at}, more than the "
+            f"{rows.path}: claims {claimed} chunks at offset {table_at}, more than the "
             f"{table_at - rows.offset} bytes before it hold: it is damaged"
         )
     with _laspy_errors(rows.path, f"table of chunks at offset {table_at}"):
-        vlr = lazrs.LazVlr(header.vlrs[header.vlrs.index("LasZipVlr")].record_data)
+        vlr = lazrs.LazVlr(packing)
         if vlr.item_size() != rows.size:
             raise ValueError(f"its chunks hold points of {vlr.item_size()} bytes, not {rows.size}")
         file.seek(rows.offset)
@@ -228,10 +254,16 @@ def _chunks(
     spare = 0 if vlr.uses_variable_size_chunks() else vlr.chunk_size()
     if not points - spare <= rows.count <= points or rows.offset + 8 + packed > table_at:
         raise CorruptSourceError(
-            f"{rows.path}: its header claims {rows.count} points, its {chunks} chunks hold "
+            f"{rows.path}: its header claims {rows.count} points, its {len(table)} chunks hold "
             f"{points} in {packed} bytes before offset {table_at}: it is damaged"
         )
-    return tuple(count for count, _ in table)
+    chunks, start, offset = [], 0, rows.offset + 8
+    for count, packed_bytes in table:
+        span = Span(start, min(start + count, rows.count))
+        if span.start < span.stop:
+            chunks.append(_Chunk(span, offset, packed_bytes))
+        start, offset = span.stop, offset + packed_bytes
+    return tuple(chunks)
 
 
 def _crs(header: laspy.LasHeader, path: str) -> tuple[str | None, tuple[str, ...]]:

@@ -1,0 +1,387 @@
+"""One conformance test over all formats: the same points in, the same points out, or an error."""
+
+import functools
+import tracemalloc
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from tilestream.errors import (
+    CorruptSourceError,
+    SourceError,
+    SourceNotFoundError,
+    UnknownFormatError,
+    UsageError,
+)
+from tilestream.formats import FORMATS, describe, expand_sources, open_source
+from tilestream.formats.las import write_las
+from tilestream.formats.pcd import write_pcd
+from tilestream.formats.ply import write_ply
+
+Points = NDArray[np.float64]
+HALF_MM = 0.0005 + 1e-9
+
+
+def write_e57(path: Path, points: Points) -> None:
+    """Two scans with poses, as a scanner stores them: near its own origin, in single precision."""
+    pye57 = pytest.importorskip("pye57")
+    path.unlink(missing_ok=True)
+    quarter = np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
+    with pye57.E57(str(path), "w") as file:
+        for part in np.array_split(points, 2):
+            if len(part):
+                place = np.round(part.mean(axis=0))
+                east, north, up = (part - place).T
+                scan = {"cartesianX": north, "cartesianY": -east, "cartesianZ": up}
+                file.write_scan_raw(scan, translation=place, rotation=quarter)
+
+
+def write_map_directory(path: Path, points: Points) -> None:
+    (path / "pointcloud_map.pcd").mkdir(parents=True, exist_ok=True)
+    lines = ["x_resolution: 20.0", "y_resolution: 20.0"]
+    for i, part in enumerate(np.array_split(points, 3)):
+        write_pcd(path / "pointcloud_map.pcd" / f"{i}.pcd", part, encoding="binary_compressed")
+        lines.append(f"{i}.pcd: [{20 * i}, 0]")
+    (path / "pointcloud_map_metadata.yaml").write_text("\n".join(lines))
+
+
+@dataclass(frozen=True)
+class Case:
+    file: str
+    write: Callable[[Path, Points], None]
+    tolerance: float
+    holds_nan: bool = True
+
+
+CASES = {
+    "pcd ascii": Case("a.pcd", functools.partial(write_pcd, encoding="ascii"), 0.0),
+    "pcd binary": Case("b.pcd", write_pcd, 0.0),
+    "pcd compressed": Case(
+        "c.pcd", functools.partial(write_pcd, encoding="binary_compressed"), 0.0
+    ),
+    "ply ascii": Case("a.ply", functools.partial(write_ply, encoding="ascii"), 0.0),
+    "ply little": Case("l.PLY", write_ply, 0.0),
+    "ply big": Case("b.ply", functools.partial(write_ply, encoding="binary_big_endian"), 0.0),
+    "las": Case("a.las", write_las, HALF_MM, holds_nan=False),
+    "laz": Case("a.laz", write_las, HALF_MM, holds_nan=False),
+    "e57": Case("a.e57", write_e57, HALF_MM, holds_nan=False),
+    "autoware": Case("map", write_map_directory, 0.0),
+}
+IN_ONE_FILE = [name for name in CASES if name != "autoware"]
+N = 1000
+
+
+def far_points(n: int) -> Points:
+    """Points of a street block in UTM, 4,000,000 m from the origin."""
+    rng = np.random.default_rng(n)
+    return rng.uniform([4e6 - 60, 5e5 - 60, -3], [4e6 + 60, 5e5 + 60, 40], (n, 3))
+
+
+def read(path: Path, span_points: int = N, block_points: int = N) -> tuple[Points, int]:
+    source = open_source(path)
+    blocks = [
+        block
+        for span in source.spans(span_points)
+        for block in open_source(path).blocks(span, block_points)
+    ]
+    points = np.concatenate([np.empty((0, 3)), *(block.points for block in blocks)])
+    return points, sum(block.dropped for block in blocks)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("formats")
+    for case in CASES.values():
+        case.write(folder / case.file, far_points(N))
+    return {name: folder / case.file for name, case in CASES.items()}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_same_points_in_same_points_out(name: str, files: dict[str, Path]) -> None:
+    points, dropped = read(files[name])
+    assert points.dtype == np.float64
+    assert dropped == 0
+    assert points.shape == (N, 3)
+    assert np.abs(points - far_points(N)).max() <= CASES[name].tolerance
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_info_agrees_with_the_content(name: str, files: dict[str, Path]) -> None:
+    found = describe(files[name])
+    paths = [p for p in files[name].rglob("*.pcd") if p.is_file()] or [files[name]]
+    assert found.path == str(files[name])
+    assert found.points == N
+    assert found.size_bytes == sum(p.stat().st_size for p in paths)
+    assert found.crs is None
+    assert found.fields
+    assert found.bounds is not None
+    for edge, truth in zip(found.bounds, (np.min, np.max), strict=True):
+        assert np.abs(edge - truth(far_points(N), axis=0)).max() <= HALF_MM
+
+
+@pytest.mark.parametrize("name", CASES)
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.differing_executors])
+@given(
+    span_points=st.integers(1, N + 300), block_points=st.integers(1, N + 300), seed=st.integers()
+)
+def test_spans_and_blocks_are_the_file_in_pieces(
+    name: str, files: dict[str, Path], span_points: int, block_points: int, seed: int
+) -> None:
+    spans = open_source(files[name]).spans(span_points)
+    assert [s.start for s in spans] == [0, *(s.stop for s in spans[:-1])]
+    assert spans[-1].stop == N
+    assert all(s.start < s.stop for s in spans)
+
+    parts: dict[int, Points] = {}
+    order = np.random.default_rng(abs(seed)).permutation(len(spans))[:20]
+    for i in order:
+        blocks = list(open_source(files[name]).blocks(spans[i], block_points))
+        assert all(len(b.points) + b.dropped <= block_points for b in blocks)
+        parts[i] = np.concatenate([b.points for b in blocks])
+    whole = read(files[name])[0]
+    for i, part in parts.items():
+        assert np.array_equal(part, whole[spans[i].start : spans[i].stop])
+
+
+@pytest.mark.parametrize("name", ["pcd binary", "ply little", "ply big", "las"])
+def test_formats_of_equal_rows_read_any_span(name: str, files: dict[str, Path]) -> None:
+    assert len(open_source(files[name]).spans(10)) == N // 10
+
+
+@pytest.mark.parametrize("name", IN_ONE_FILE)
+def test_a_file_cut_anywhere_is_an_error(name: str, files: dict[str, Path], tmp_path: Path) -> None:
+    content = files[name].read_bytes()
+    rng = np.random.default_rng(1)
+    cuts = {*range(0, 400, 7), *rng.integers(0, len(content), 60).tolist()}
+    cuts |= {len(content) - k for k in (1, 2, 3, 4, 8, 16, 1024)}
+    cut = tmp_path / files[name].name
+    for length in sorted(k for k in cuts if 0 <= k < len(content)):
+        cut.write_bytes(content[:length])
+        with pytest.raises(CorruptSourceError, match=cut.name):
+            read(cut)
+
+
+@pytest.mark.parametrize("name", IN_ONE_FILE)
+def test_a_damaged_file_is_an_error_or_numbers_and_no_crash(
+    name: str, files: dict[str, Path], tmp_path: Path
+) -> None:
+    content = files[name].read_bytes()
+    rng = np.random.default_rng(2)
+    damaged, refusals = tmp_path / files[name].name, []
+    for i in range(120):
+        flipped = bytearray(content)
+        reach = 400 if i % 2 else len(content)
+        flipped[int(rng.integers(reach))] ^= int(rng.integers(1, 256))
+        damaged.write_bytes(flipped)
+        try:
+            points, dropped = read(damaged)
+        except SourceError as error:
+            refusals.append(str(error))
+        else:
+            assert len(points) + dropped <= N
+            assert np.isfinite(points).all()
+    assert refusals
+    assert [r for r in refusals if damaged.name not in r or "\n" in r] == []
+
+
+@pytest.mark.parametrize("name", [n for n, case in CASES.items() if case.holds_nan])
+def test_points_that_are_not_finite_are_dropped_and_counted(name: str, tmp_path: Path) -> None:
+    points = far_points(N)
+    points[7, 0], points[500, 1], points[999, 2] = np.nan, np.inf, -np.inf
+    points[600] = np.nan
+    path = tmp_path / CASES[name].file
+    CASES[name].write(path, points)
+    kept, dropped = read(path, block_points=77)
+    assert dropped == 4
+    assert np.array_equal(kept, points[np.isfinite(points).all(axis=1)])
+    assert "4 points are not finite" in describe(path).notes
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_file_without_points_is_a_source_without_spans(name: str, tmp_path: Path) -> None:
+    path = tmp_path / CASES[name].file
+    CASES[name].write(path, np.empty((0, 3)))
+    assert open_source(path).spans(10) == []
+    assert describe(path).points == 0
+    assert describe(path).bounds is None
+
+
+HUGE = 10**12
+CLAIMS: dict[str, Callable[[bytes], bytes]] = {
+    "pcd ascii": lambda b: b.replace(b"1000\n", b"%d\n" % HUGE),
+    "pcd binary": lambda b: b.replace(b"1000\n", b"%d\n" % HUGE),
+    "pcd compressed": lambda b: b.replace(b"1000\n", b"%d\n" % HUGE),
+    "ply ascii": lambda b: b.replace(b"vertex 1000\n", b"vertex %d\n" % HUGE),
+    "ply little": lambda b: b.replace(b"vertex 1000\n", b"vertex %d\n" % HUGE),
+    "ply big": lambda b: b.replace(b"vertex 1000\n", b"vertex %d\n" % HUGE),
+    "las": lambda b: b[:247] + HUGE.to_bytes(8, "little") + b[255:],
+    "laz": lambda b: b[:247] + HUGE.to_bytes(8, "little") + b[255:],
+}
+
+
+@pytest.mark.parametrize("name", CLAIMS)
+def test_a_header_that_claims_too_much_is_refused_before_allocating(
+    name: str, files: dict[str, Path], tmp_path: Path
+) -> None:
+    path = tmp_path / files[name].name
+    content = files[name].read_bytes()
+    path.write_bytes(CLAIMS[name](content))
+    assert path.read_bytes() != content
+    tracemalloc.start()
+    with pytest.raises(CorruptSourceError, match=str(HUGE)):
+        open_source(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 5_000_000
+
+
+@pytest.mark.parametrize("name", IN_ONE_FILE)
+def test_a_wrong_ending_says_what_the_content_is(
+    name: str, files: dict[str, Path], tmp_path: Path
+) -> None:
+    right = files[name].suffix.lower()
+    content = files[name].read_bytes()
+    known = next(f for f in FORMATS if right in f.endings)
+    for wrong in (".pcd", ".las", ".ply", ".e57", ".mcap", ".txt", ""):
+        if wrong in known.endings:
+            continue
+        path = tmp_path / f"wrong{wrong}"
+        path.write_bytes(content)
+        with pytest.raises(UnknownFormatError, match=f"looks like {known.name}, rename|; rename"):
+            open_source(path)
+
+
+def test_content_of_no_format_is_refused(tmp_path: Path) -> None:
+    for name in ("a.pcd", "a.laz", "a.ply", "a.e57", "a.mcap", "a.csv", "a"):
+        (tmp_path / name).write_text("x,y,z\n1,2,3\n")
+        with pytest.raises(UnknownFormatError, match=name):
+            open_source(tmp_path / name)
+    with pytest.raises(UnknownFormatError, match="supported are PCD"):
+        open_source(tmp_path / "a.csv")
+
+
+def test_an_empty_file_is_cut_short(tmp_path: Path) -> None:
+    for format_ in FORMATS:
+        path = tmp_path / f"a{format_.endings[0]}"
+        path.write_bytes(b"")
+        with pytest.raises(CorruptSourceError, match="empty or cut short"):
+            open_source(path)
+
+
+def test_missing_files_are_named(tmp_path: Path) -> None:
+    for path in (tmp_path / "no.pcd", tmp_path / "*.laz"):
+        with pytest.raises(SourceNotFoundError, match=path.name.replace("*", r"\*")):
+            expand_sources(path)
+    with pytest.raises(SourceNotFoundError, match=r"no\.pcd"):
+        open_source(tmp_path / "no.pcd")
+
+
+def test_sources_are_sorted_and_each_once(tmp_path: Path, files: dict[str, Path]) -> None:
+    for name in ("b.pcd", "a.pcd", "c[1].pcd", "d.las"):
+        (tmp_path / name).write_bytes(b"x")
+    (tmp_path / "deep" / "er").mkdir(parents=True)
+    (tmp_path / "deep" / "er" / "e.pcd").write_bytes(b"x")
+    (tmp_path / "link.pcd").symlink_to(tmp_path / "a.pcd")
+
+    def names(*patterns: str) -> list[str]:
+        found = expand_sources([tmp_path / p for p in patterns])
+        return [str(Path(f).relative_to(tmp_path)) for f in found]
+
+    assert names("*.pcd", "a.pcd", "d.las") == ["a.pcd", "b.pcd", "c[1].pcd", "d.las"]
+    assert names("deep/../b.pcd", "b.pcd") == ["deep/../b.pcd"]
+    assert names("**/*.pcd") == ["a.pcd", "b.pcd", "c[1].pcd", "deep/er/e.pcd"]
+    assert names("c[1].pcd") == ["c[1].pcd"]
+    parts = expand_sources(files["autoware"])
+    assert [Path(p).name for p in parts] == ["0.pcd", "1.pcd", "2.pcd"]
+    assert expand_sources([f"{files['autoware'].parent}/m*", *parts]) == parts
+
+
+def test_options_go_to_the_format_that_takes_them(files: dict[str, Path]) -> None:
+    assert open_source(files["las"], points_topic="/lidar").info().points == N
+    with pytest.raises(UsageError, match="colour"):
+        open_source(files["las"], colour="red")
+
+
+def test_a_span_outside_of_the_source_is_refused(files: dict[str, Path]) -> None:
+    for path in files.values():
+        source = open_source(path)
+        beyond = type(source.spans(10)[0])(0, N + 1)
+        with pytest.raises(UsageError, match="is not inside"):
+            list(source.blocks(beyond, 10))
+
+
+def test_a_writer_refuses_what_it_cannot_write(tmp_path: Path) -> None:
+    for name in ("las", "laz"):
+        with pytest.raises(UsageError, match="NaN"):
+            write_las(tmp_path / CASES[name].file, np.full((1, 3), np.nan))
+    with pytest.raises(UsageError, match="4,294 km"):
+        write_las(tmp_path / "a.las", np.array([[0.0, 0, 0], [5e6, 0, 0]]))
+    with pytest.raises(UsageError, match="shape"):
+        write_pcd(tmp_path / "a.pcd", np.zeros((3, 2)))
+    with pytest.raises(UsageError, match="one per point"):
+        write_pcd(tmp_path / "a.pcd", np.zeros((3, 3)), fields={"i": np.zeros(2)})
+    with pytest.raises(UsageError, match="not x, y or z"):
+        write_pcd(tmp_path / "a.pcd", np.zeros((3, 3)), fields={"x": np.zeros(3)})
+    with pytest.raises(UsageError, match="PLY has no"):
+        write_ply(tmp_path / "a.ply", np.zeros((1, 3)), fields={"t": np.zeros(1, np.int64)})
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["pcd binary", "ply little", "las", "laz"])
+def test_a_writer_that_fails_leaves_the_old_file(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def disk_full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    path = tmp_path / CASES[name].file
+    CASES[name].write(path, far_points(10))
+    before = path.read_bytes()
+    monkeypatch.setattr("os.fsync", disk_full)
+    with pytest.raises(OSError, match="No space"):
+        CASES[name].write(path, far_points(20))
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_formats_print_for_a_help_text() -> None:
+    assert str(FORMATS[0]) == "PCD (.pcd): ascii, binary, binary_compressed"
+    assert {ending for f in FORMATS for ending in f.endings} == {
+        ".pcd",
+        ".las",
+        ".laz",
+        ".ply",
+        ".e57",
+        ".mcap",
+    }
+
+
+@pytest.mark.parametrize(
+    "recording",
+    [
+        "pcd/hdl64_street.pcd",
+        "pcd/vls128_street.pcd",
+        "scan_pair/251370668.pcd",
+        "scan_pair/251371071.pcd",
+    ],
+)
+def test_real_recordings_against_a_plain_parse(shared_data: Path, recording: str) -> None:
+    path = shared_data / recording
+    content = path.read_bytes()
+    start = content.index(b"DATA binary\n") + len(b"DATA binary\n")
+    width = 4 if b"FIELDS x y z intensity" in content[:start] else 3
+    count = int(content[:start].split(b"POINTS ")[1].split()[0])
+    stored = np.frombuffer(content, "<f4", count * width, start)
+    truth = stored.reshape(-1, width)[:, :3].astype(float)
+    truth = truth[np.isfinite(truth).all(axis=1)]
+    points, dropped = read(path, span_points=50_000, block_points=7_777)
+    assert np.array_equal(points, truth)
+    found = describe(path)
+    assert found.points == len(truth) + dropped
+    assert found.bounds == (tuple(truth.min(axis=0)), tuple(truth.max(axis=0)))
