@@ -14,7 +14,7 @@ from tilestream.formats.route_files import DEGREES, Path3
 from tilestream.records import Float64
 
 NOT_FOR_VEHICLES = frozenset(
-    {"crosswalk", "walkway", "shared_walkway", "pedestrian_lane", "stairs", "bicycle_lane"}
+    {"crosswalk", "walkway", "shared_walkway", "pedestrian_lane", "stairs", "bicycle_lane", "rail"}
 )
 """Subtypes of lanelets that are left out."""
 MIN_SAMPLES = 10

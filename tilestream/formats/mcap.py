@@ -241,6 +241,8 @@ def _open(
         index = _read_through(file, points_topic, tracks)
         if file.lost:
             notes.append(f"{file.lost}; {len(index.stamps)} whole scans recovered")
+        if file.unchecked:
+            notes.append("has records without a CRC: damage to them cannot be seen")
         pose_topic, poses = choose_poses(
             path, list(tracks.values()), index.frame, pose_topic, map_frame, pose_frame,
             max_gap_s, notes,

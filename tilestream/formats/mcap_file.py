@@ -68,6 +68,9 @@ class Message:
 class McapFile:
     """An MCAP file that is open for reading.
 
+    Once messages were read, `lost` says what a cut file lacks (None: nothing), and `unchecked`
+    whether some of them lay in records without a CRC, where damage cannot be seen.
+
     Args:
         path: the file.
         topics: False leaves out what only `unpack` does not need: summary and topics.
@@ -92,6 +95,7 @@ class McapFile:
             self.size = self._stream.seek(0, io.SEEK_END)
             self.whole = self._check_magic()
             self.lost: str | None = None
+            self.unchecked = False
             self._channels: dict[int, tuple[str, str, str]] = {}
             self._schemas: dict[int, str] = {}
             self._summary = self._read_summary() if self.whole and topics else None
@@ -236,6 +240,7 @@ class McapFile:
         recorded = int.from_bytes(content[RECORD_HEAD.size : RECORD_HEAD.size + 4], "little")
         if recorded not in (0, crc):
             raise self._corrupt(at, f"(end of data) gives CRC {recorded:#x}, the data {crc:#x}")
+        self.unchecked &= recorded == 0
 
     def _record(self, at: int) -> tuple[int, bytes]:
         """Opcode and bytes, head included, of the record at an offset."""
@@ -252,6 +257,7 @@ class McapFile:
 
     def _unpacked(self, at: int, opcode: int, content: bytes) -> bytes:
         if opcode == Opcode.MESSAGE:
+            self.unchecked = True
             return content
         if opcode != Opcode.CHUNK:
             raise self._corrupt(at, f"should be a chunk and is of opcode {opcode}")
@@ -259,6 +265,7 @@ class McapFile:
             chunk = Chunk.read(ReadDataStream(io.BytesIO(content[RECORD_HEAD.size :])))
             if chunk.uncompressed_size > LARGEST_CHUNK:
                 raise self._corrupt(at, f"claims to unpack to {chunk.uncompressed_size} bytes")
+            self.unchecked |= chunk.uncompressed_crc == 0
             stream, length = get_chunk_data_stream(chunk, validate_crc=True)
             data = stream.read(length)
         except CRCValidationError as error:
@@ -286,11 +293,17 @@ class McapFile:
             yield opcode, start, at
 
     def _learn(self, opcode: int, content: bytes) -> None:
-        if opcode == Opcode.SCHEMA:
-            schema = Schema.read(ReadDataStream(io.BytesIO(content)))
-            self._schemas[schema.id] = schema.name
-        elif opcode == Opcode.CHANNEL:
-            self._learn_channel(Channel.read(ReadDataStream(io.BytesIO(content))))
+        stream = ReadDataStream(io.BytesIO(content))
+        try:
+            if opcode == Opcode.SCHEMA:
+                schema = Schema.read(stream)
+                self._schemas[schema.id] = schema.name
+            elif opcode == Opcode.CHANNEL:
+                self._learn_channel(Channel.read(stream))
+        except (McapError, struct.error, ValueError) as error:
+            raise CorruptSourceError(
+                f"{self.path}: a schema or channel cannot be read ({error}); copy the file anew"
+            ) from error
 
     def _learn_channel(self, channel: Channel) -> None:
         named = self._schemas.get(channel.schema_id, "").replace("/msg/", "/")

@@ -43,7 +43,7 @@ float64 x
 float64 y
 float64 z
 """
-_POINT_CLOUD = (
+POINT_CLOUD_SCHEMA = (
     """\
 std_msgs/Header header
 uint32 height
@@ -63,7 +63,7 @@ uint32 count
 """
     + _HEADER
 )
-_ODOMETRY = (
+ODOMETRY_SCHEMA = (
     """\
 std_msgs/Header header
 string child_frame_id
@@ -95,7 +95,7 @@ geometry_msgs/Vector3 angular
     + _QUATERNION
     + _HEADER
 )
-_TF = (
+TF_SCHEMA = (
     """\
 geometry_msgs/TransformStamped[] transforms
 ================================================================================
@@ -140,9 +140,11 @@ class LogWriter:
         self.map_frame, self.lidar_frame = map_frame, lidar_frame
         self._stream = Path(path).open("wb")  # noqa: SIM115 - __exit__ closes it
         self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES)
-        self._clouds = self._writer.register_msgdef("sensor_msgs/msg/PointCloud2", _POINT_CLOUD)
-        self._odometry = self._writer.register_msgdef("nav_msgs/msg/Odometry", _ODOMETRY)
-        self._tf = self._writer.register_msgdef("tf2_msgs/msg/TFMessage", _TF)
+        self._clouds = self._writer.register_msgdef(
+            "sensor_msgs/msg/PointCloud2", POINT_CLOUD_SCHEMA
+        )
+        self._odometry = self._writer.register_msgdef("nav_msgs/msg/Odometry", ODOMETRY_SCHEMA)
+        self._tf = self._writer.register_msgdef("tf2_msgs/msg/TFMessage", TF_SCHEMA)
 
     def __enter__(self) -> Self:
         return self

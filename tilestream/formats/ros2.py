@@ -210,8 +210,9 @@ def _point_type(
 def positions(rows: NDArray[np.void]) -> Float64:
     """(n, 3) x, y, z of packed points [m]."""
     points = np.empty((len(rows), 3))
-    for axis, name in enumerate("xyz"):
-        points[:, axis] = rows[name]
+    with np.errstate(invalid="ignore"):  # a signalling NaN is a NaN
+        for axis, name in enumerate("xyz"):
+            points[:, axis] = rows[name]
     return points
 
 

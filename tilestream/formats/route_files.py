@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -96,8 +97,7 @@ def read_geojson(path: str) -> list[Path3]:
         raise CorruptSourceError(f"{path}: no GeoJSON ({error})") from error
     if not isinstance(root, dict):
         raise CorruptSourceError(f"{path}: no GeoJSON: an object is expected at its top")
-    crs = root.get("crs") or {}
-    crs_name = crs.get("properties", {}).get("name") if isinstance(crs, dict) else None
+    crs_name = _crs_name(path, root.get("crs"))
     found, seen = [], []
     for index, (name, geometry) in enumerate(_geometries(root, None)):
         kind, coordinates = geometry.get("type"), geometry.get("coordinates")
@@ -113,6 +113,16 @@ def read_geojson(path: str) -> list[Path3]:
         kinds = ", ".join(sorted(set(seen))) or "no geometry"
         raise CorruptSourceError(f"{path}: holds no LineString but {kinds}")
     return found
+
+
+def _crs_name(path: str, member: object) -> str | None:
+    """The CRS of GeoJSON's older edition."""
+    if member is None:
+        return None
+    try:
+        return str(member["properties"]["name"])  # type: ignore[index] # whatever a file holds
+    except (TypeError, KeyError):
+        raise CorruptSourceError(f"{path}: its crs has no name: {member!r}") from None
 
 
 def _geometries(node: object, name: str | None) -> Iterator[tuple[str | None, dict[str, object]]]:
@@ -157,7 +167,7 @@ def _number(path: str, place: str, word: object) -> float:
         value = float(word)  # type: ignore[arg-type] # whatever a file holds
     except (TypeError, ValueError):
         raise CorruptSourceError(f"{path}: {place} is no number: {word!r}") from None
-    if not np.isfinite(value):
+    if not math.isfinite(value):
         raise CorruptSourceError(f"{path}: {place} is not finite: {word!r}")
     return value
 

@@ -1,6 +1,7 @@
 """Routes in and out: from any file that draws a path to points at equal arc length."""
 
 import json
+import math
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -65,9 +66,10 @@ def read_routes(
     kept, the heading follows it. The order of a file's routes is the file's.
 
     Degrees: coordinates are taken for degrees where the file says so, or where all fit longitude
-    and latitude and either the whole file extends over less than 1 unit, or half of its steps are
-    shorter than 0.001 units. (In metres that would be a route of less than 1 m, or one recorded
-    every millimetre.) They are refused unless `project_to` says where to.
+    and latitude and either the whole file extends over less than 1 unit, or (in drawn routes; poses
+    are recorded many times a second, also while a vehicle stands) half of the steps are shorter
+    than 0.001 units. In metres that would be a route of less than 1 m, or one drawn every
+    millimetre. Degrees are refused unless `project_to` says where to.
 
     Args:
         path: the file.
@@ -100,7 +102,8 @@ def read_routes(
     if not paths:
         raise CorruptSourceError(f"{name}: holds no route")
     crs = crs or paths[0].crs
-    points = _metric(name, [p.positions for p in paths], crs, project_to)
+    drawn = READERS.get(ending, read_poses) is not read_poses
+    points = _metric(name, [p.positions for p in paths], crs, project_to, drawn)
     crs = project_to or crs
     lift = z_offset or (np.nan if ending == ".mcap" and z_offset is None else 0.0)
     return [
@@ -275,21 +278,21 @@ def _log_path(path: str, pose_topic: str | None) -> Path3:
 
 
 def _metric(
-    path: str, points: list[Float64], crs: str | None, project_to: str | None
+    path: str, points: list[Float64], crs: str | None, project_to: str | None, drawn: bool
 ) -> list[Float64]:
     """The points in metres: as they are, or projected from degrees."""
     system, target = _crs(path, crs), _crs(path, project_to)
     if target is not None and target.is_geographic:
         raise CrsError(f"{path}: project_to = {project_to!r} is in degrees; name a metric CRS")
-    degrees = system.is_geographic if system is not None else _look_like_degrees(points)
+    degrees = system.is_geographic if system is not None else _look_like_degrees(points, drawn)
     if not degrees:
         if project_to is not None:
             raise CrsError(f"{path}: is not in degrees, so it cannot be projected to {project_to}")
         return points
     if target is None:
         raise CrsError(
-            f"{path}: coordinates in degrees, not metres; project them to the map's CRS first, or "
-            "name it as project_to"
+            f"{path}: coordinates in degrees, not metres (or a path of less than a metre); project "
+            "them to the map's CRS first, or name it as project_to"
         )
     to_map = Transformer.from_crs(system or CRS.from_epsg(4326), target, always_xy=True)
     projected = []
@@ -306,7 +309,7 @@ def _crs(path: str, name: str | None) -> CRS | None:
         raise CrsError(f"{path}: {name!r} is no CRS that pyproj knows ({error})") from error
 
 
-def _look_like_degrees(points: list[Float64]) -> bool:
+def _look_like_degrees(points: list[Float64], drawn: bool) -> bool:
     every = np.concatenate(points)[:, :2]
     every = every[np.isfinite(every).all(axis=1)]
     if len(every) < 2:
@@ -317,7 +320,7 @@ def _look_like_degrees(points: list[Float64]) -> bool:
     steps = np.concatenate([np.linalg.norm(np.diff(xyz[:, :2], axis=0), axis=1) for xyz in points])
     steps = steps[steps > 0]
     extent = np.ptp(every, axis=0).max()
-    return bool(extent > 0 and (extent < 1.0 or np.median(steps) < 1e-3))
+    return bool(extent > 0 and (extent < 1.0 or (drawn and np.median(steps) < 1e-3)))
 
 
 def _distinct(points: Float64) -> list[int]:
@@ -325,9 +328,7 @@ def _distinct(points: Float64) -> list[int]:
     kept: list[int] = []
     last: list[float] | None = None
     for index, point in enumerate(points.tolist()):
-        if last is None or sum((a - b) ** 2 for a, b in zip(point, last, strict=True)) >= (
-            REPEATED_M**2
-        ):
+        if last is None or math.dist(point, last) >= REPEATED_M:
             kept.append(index)
             last = point
     return kept

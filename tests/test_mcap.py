@@ -1,0 +1,603 @@
+"""Logs of scans: against the ROS library's own decoding, and every way a file can be made."""
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import logs
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from logs import SECOND, START, pose
+from mcap.writer import CompressionType, IndexType
+from scipy.spatial.transform import Rotation
+
+from tilestream.errors import PoseError, SourceError, UsageError
+from tilestream.formats.mcap import ScanSelection, looks_like_mcap, open_drive, open_log
+from tilestream.formats.mcap_file import McapFile
+from tilestream.formats.mcap_write import LogWriter, write_log
+from tilestream.formats.poses import PoseStatus
+from tilestream.records import Scan, Trajectory
+
+MAKES: dict[str, dict[str, Any]] = {
+    "zstd": {"chunk_size": 4096, "compression": CompressionType.ZSTD},
+    "lz4": {"chunk_size": 4096, "compression": CompressionType.LZ4},
+    "plain chunks": {"chunk_size": 4096, "compression": CompressionType.NONE},
+    "one chunk": {"chunk_size": 10**9},
+    "no chunks": {"use_chunking": False},
+    "no chunks, data crc": {"use_chunking": False, "enable_data_crcs": True},
+    "no crc": {"enable_crcs": False},
+    "no chunk index": {"index_types": IndexType.NONE},
+    "no message index": {"index_types": IndexType.CHUNK},
+    "no statistics": {"use_statistics": False},
+    "no repeated channels": {"repeat_channels": False, "repeat_schemas": False},
+    "no summary": {
+        "index_types": IndexType.NONE,
+        "repeat_channels": False,
+        "repeat_schemas": False,
+        "use_statistics": False,
+        "use_summary_offsets": False,
+    },
+}
+
+
+def assert_same_scans(a: list[Scan], b: list[Scan]) -> None:
+    assert [s.stamp_ns for s in a] == [s.stamp_ns for s in b]
+    for one, other in zip(a, b, strict=True):
+        np.testing.assert_array_equal(one.points, other.points)
+        np.testing.assert_array_equal(one.T_map_lidar, other.T_map_lidar)
+
+
+@pytest.fixture(scope="module")
+def drive(shared_data: Path) -> Path:
+    return shared_data / "kitti_drive" / "drive.mcap"
+
+
+# --- the real drive
+
+
+def test_the_real_drive_equals_an_independent_decoding(drive: Path) -> None:
+    log = open_log(drive)
+    clouds = logs.decode(drive, "/velodyne_points")
+    poses = logs.decode(drive, "/odometry")
+    assert len(log) == len(clouds) == 52
+    assert log.posed.all()
+    assert log.notes == ()
+    assert (log.points_topic, log.pose_topic, log.frame) == (
+        "/velodyne_points",
+        "/odometry",
+        "velodyne",
+    )
+    for scan, message, odometry in zip(log.scans(), clouds, poses, strict=True):
+        expected = np.frombuffer(message.data, np.float32).reshape(-1, 4)
+        np.testing.assert_array_equal(scan.points, expected[:, :3].astype(float))
+        np.testing.assert_array_equal(scan.intensity, expected[:, 3])
+        assert scan.dropped == 0
+        stamp = message.header.stamp
+        assert scan.stamp_ns == stamp.sec * SECOND + stamp.nanosec
+        position, turn = odometry.pose.pose.position, odometry.pose.pose.orientation
+        assert scan.T_map_lidar is not None
+        assert tuple(scan.T_map_lidar[:3, 3]) == (position.x, position.y, position.z)
+        R = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
+        np.testing.assert_allclose(scan.T_map_lidar[:3, :3], R, atol=1e-15)
+
+
+def test_the_real_drive_as_map_points(drive: Path) -> None:
+    source = open_drive(drive)
+    info = source.info()
+    spans = source.spans(1_000_000)
+    points = np.concatenate([b.points for s in spans for b in source.blocks(s, 200_000)])
+    lowest, highest, count = np.full(3, np.inf), np.full(3, -np.inf), 0
+    poses = logs.decode(drive, "/odometry")
+    for message, odometry in zip(logs.decode(drive, "/velodyne_points"), poses, strict=True):
+        xyz = np.frombuffer(message.data, np.float32).reshape(-1, 4)[:, :3].astype(float)
+        p, q = odometry.pose.pose.position, odometry.pose.pose.orientation
+        moved = Rotation.from_quat([q.x, q.y, q.z, q.w]).apply(xyz) + np.array([p.x, p.y, p.z])
+        lowest, highest = np.minimum(lowest, moved.min(0)), np.maximum(highest, moved.max(0))
+        count += len(moved)
+    assert info.points == len(points) == count == 6_317_377
+    np.testing.assert_allclose(points.min(0), lowest, atol=1e-9)
+    np.testing.assert_allclose(points.max(0), highest, atol=1e-9)
+    text = "\n".join(info.notes)
+    assert "52 scans" in text
+    assert "52 with a pose" in text
+    assert "71.4 m" in text or "71.5 m" in text
+
+
+def test_every_second_scan_maps_and_the_others_localize(drive: Path) -> None:
+    log = open_log(drive)
+    maps, localizes = (ScanSelection(every=2, offset=i) for i in (0, 1))
+    used = [s.indices(log.stamps_ns) for s in (maps, localizes)]
+    assert sorted(np.concatenate(used)) == list(range(52))
+    half = open_drive(drive, scans=maps).info()
+    assert half.points == log.point_counts[::2].sum()
+    assert "26 scans" in "\n".join(half.notes)
+
+
+def test_a_slice_reads_only_its_chunks(drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = open_log(drive)
+    chunks = set(log.places[10:15, 0].tolist())
+    read: list[int] = []
+    unpack = McapFile.unpack
+
+    def counting(self: McapFile, record: int) -> bytes:
+        read.append(record)
+        return unpack(self, record)
+
+    monkeypatch.setattr(McapFile, "unpack", counting)
+    scans = list(log.scans(10, 15))
+    assert len(scans) == 5
+    assert len(read) == len(chunks) < 4
+    assert set(read) == chunks
+
+
+# --- every make of file
+
+
+@pytest.mark.parametrize("make", MAKES)
+def test_the_make_of_the_file_does_not_matter(make: str, tmp_path: Path) -> None:
+    source = logs.street_log(tmp_path / "source.mcap")
+    other = logs.rewrite(source, tmp_path / "other.mcap", **MAKES[make])
+    expected, found = open_log(source), open_log(other)
+    assert len(found) == 12
+    unchecked = make in ("no chunks", "no crc")
+    assert found.notes == (
+        ("has records without a CRC: damage to them cannot be seen",) * unchecked
+    )
+    assert {(t.name, t.messages) for t in found.topics} == {("/points", 12), ("/odometry", 12)}
+    assert_same_scans(list(expected.scans()), list(found.scans()))
+    assert_same_scans(list(expected.scans(7, 3, -2)), list(found.scans(7, 3, -2)))
+
+
+def test_points_are_those_that_were_written(tmp_path: Path) -> None:
+    log = open_log(logs.street_log(tmp_path / "a.mcap", scans=3, seed=9))
+    rng = np.random.default_rng(9)
+    for scan in log.scans():
+        np.testing.assert_array_equal(scan.points, logs.street_points(rng))
+
+
+def test_a_log_can_be_sent_to_another_process(tmp_path: Path) -> None:
+    path = logs.street_log(tmp_path / "a.mcap")
+    source = open_drive(path, range_max=25.0)
+    sent = pickle.loads(pickle.dumps(source))
+    span = source.spans(500)[1]
+    for here, there in zip(source.blocks(span, 90), sent.blocks(span, 90), strict=True):
+        np.testing.assert_array_equal(here.points, there.points)
+
+
+def test_a_changed_log_is_read_anew(tmp_path: Path) -> None:
+    path = logs.street_log(tmp_path / "a.mcap", scans=4)
+    before = open_log(path)
+    logs.street_log(path, scans=7)
+    assert len(open_log(path)) == 7
+    assert len(before) == 4
+
+
+@given(points=st.integers(1, 3000), block=st.integers(1, 300))
+@settings(deadline=None, max_examples=30)
+def test_spans_and_blocks_hold_each_point_once_and_alike(
+    points: int, block: int, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "spans.mcap"
+    if not path.exists():
+        logs.street_log(path)
+    source = open_drive(path)
+    whole = np.concatenate(
+        [pose(x=float(i), yaw=0.02 * i)[:3, :3] @ s.points.T for i, s in _numbered(path)], axis=1
+    ).T + np.repeat([[float(i), 0, 0] for i in range(12)], 200, axis=0)
+    spans = source.spans(points)
+    assert [s.start for s in spans[1:]] == [s.stop for s in spans[:-1]]
+    assert (spans[0].start, spans[-1].stop) == (0, 2400)
+    blocks = [b for s in spans for b in source.blocks(s, block)]
+    assert max(len(b.points) for b in blocks) <= block
+    found = np.concatenate([b.points for b in blocks])
+    np.testing.assert_allclose(found, whole, atol=1e-9)
+    one_go = np.concatenate([b.points for s in source.spans(10**9) for b in source.blocks(s, 2400)])
+    assert found.tobytes() == one_go.tobytes()
+
+
+def _numbered(path: Path) -> list[tuple[int, Scan]]:
+    return list(enumerate(open_log(path).scans()))
+
+
+def test_range_max_leaves_out_what_is_far_from_the_lidar(tmp_path: Path) -> None:
+    path = logs.street_log(tmp_path / "a.mcap")
+    near = sum((np.linalg.norm(s.points, axis=1) <= 15.0).sum() for s in open_log(path).scans())
+    source = open_drive(path, range_max=15.0)
+    blocks = [b for s in source.spans(1000) for b in source.blocks(s, 1000)]
+    assert sum(len(b.points) for b in blocks) == near < 2400
+    assert sum(b.dropped for b in blocks) == 0
+    with pytest.raises(UsageError, match="range_max"):
+        open_drive(path, range_max=-1.0)
+
+
+@pytest.mark.parametrize(
+    ("selection", "expected"),
+    [
+        (ScanSelection(), range(12)),
+        (ScanSelection(start=3, stop=9, every=2, offset=1), [3, 5, 7]),
+        (ScanSelection(until_s=0.5), range(5)),
+        (ScanSelection(from_s=0.5), range(5, 12)),
+        (ScanSelection(stop=0), []),
+    ],
+)
+def test_a_selection(selection: ScanSelection, expected: Any, tmp_path: Path) -> None:
+    stamps = START + np.arange(12) * SECOND // 10
+    assert selection.indices(stamps).tolist() == list(expected)
+    assert selection.indices(stamps[:0]).tolist() == []
+
+
+@pytest.mark.parametrize("wrong", [{"every": 0}, {"offset": 1}, {"start": -1}, {"stop": -2}])
+def test_a_selection_that_makes_no_sense_is_refused(wrong: dict[str, int]) -> None:
+    with pytest.raises(UsageError, match="scan selection"):
+        ScanSelection(**wrong)
+
+
+def test_a_drive_without_a_posed_scan_in_the_selection_is_refused(tmp_path: Path) -> None:
+    path = logs.street_log(tmp_path / "a.mcap")
+    with pytest.raises(PoseError, match="none of its 12 scans"):
+        open_drive(path, scans=ScanSelection(start=12))
+
+
+def test_the_first_bytes_tell() -> None:
+    assert looks_like_mcap(b"\x89MCAP0\r\n\x01")
+    assert not looks_like_mcap(b"# .PCD v0.7")
+
+
+# --- clouds of every layout
+
+
+def one_cloud(path: Path, rows: np.ndarray, **changes: Any) -> Scan:
+    cloud = logs.cloud(START, rows, **changes)
+    logs.write(
+        path,
+        [
+            logs.odometry_at(START, pose()),
+            (START, "/points", "sensor_msgs/msg/PointCloud2", cloud),
+        ],
+    )
+    return next(open_log(path).scans())
+
+
+@pytest.mark.parametrize("kind", ["<f4", "<f8", ">f4", ">f8"])
+def test_floats_of_either_size_and_byte_order(kind: str, tmp_path: Path) -> None:
+    points = logs.street_points(np.random.default_rng(0), 50)
+    ring = np.arange(50, dtype=kind[0] + "u2")
+    scan = one_cloud(tmp_path / "a.mcap", logs.xyz_rows(points, kind, ring=ring))
+    np.testing.assert_array_equal(scan.points, points)
+    assert scan.points.dtype == np.float64
+    assert scan.ring is not None
+    assert scan.ring.tolist() == list(range(50))
+
+
+def test_fields_in_any_order_with_gaps(tmp_path: Path) -> None:
+    dtype = np.dtype(
+        {
+            "names": ["intensity", "z", "x", "y"],
+            "formats": ["u1", "<f4", "<f8", "<f4"],
+            "offsets": [1, 4, 24, 12],
+            "itemsize": 40,
+        }
+    )
+    rows = np.zeros(5, dtype)
+    rows["x"], rows["y"], rows["z"], rows["intensity"] = [1, 2, 3, 4, 5], 6, 7, 200
+    scan = one_cloud(tmp_path / "a.mcap", rows)
+    np.testing.assert_array_equal(scan.points, [[x, 6, 7] for x in (1, 2, 3, 4, 5)])
+    assert scan.intensity is not None
+    assert scan.intensity.tolist() == [200] * 5
+
+
+def test_an_organised_cloud_with_padded_rows(tmp_path: Path) -> None:
+    points = logs.street_points(np.random.default_rng(0), 12)
+    rows = logs.xyz_rows(points).reshape(3, 4)
+    padded = b"".join(row.tobytes() + b"\xff" * 20 for row in rows)
+    scan = one_cloud(tmp_path / "a.mcap", rows, row_step=4 * 12 + 20, data=padded)
+    np.testing.assert_array_equal(scan.points, points)
+
+
+def test_what_is_no_return_is_dropped_and_counted(tmp_path: Path) -> None:
+    points = logs.street_points(np.random.default_rng(0), 9)
+    points[1, 0], points[4, 2], points[6] = np.nan, -np.inf, 0.0
+    points[7] = [3.0, -1.0, -2.0]  # sums to 0 and is a return
+    ring = np.arange(9, dtype=np.uint16)
+    path = tmp_path / "a.mcap"
+    scan = one_cloud(path, logs.xyz_rows(points, ring=ring))
+    kept = [0, 2, 3, 5, 7, 8]
+    np.testing.assert_array_equal(scan.points, points[kept])
+    assert scan.dropped == 3
+    assert scan.ring is not None
+    assert scan.ring.tolist() == kept
+    source = open_drive(path)
+    blocks = [b for s in source.spans(4) for b in source.blocks(s, 4)]
+    assert sum(b.dropped for b in blocks) == 3
+    assert source.info().points == 9
+
+
+def test_a_cloud_without_points(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    scan = one_cloud(path, logs.xyz_rows(np.zeros((0, 3))))
+    assert scan.points.shape == (0, 3)
+    assert open_drive(path).spans(100) == []
+
+
+TIMES = np.array([0.0, 0.01, 0.05, 0.0999])
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("time", TIMES.astype("<f4")),
+        ("time", (TIMES - 0.1).astype("<f4")),
+        ("t", (TIMES * 1e9).astype("<u4")),
+        ("offset_time", (TIMES * 1e9).astype("<u4")),
+        ("time_stamp", (TIMES * 1e9).astype("<u4")),
+        ("timestamp", (TIMES + START / 1e9).astype("<f8")),
+        ("timestamp", (TIMES * 1e9 + START).astype("<f8")),
+        ("timestamp", (TIMES * 1e6 + START / 1e3).astype("<f8")),
+    ],
+)
+def test_times_of_points_come_as_seconds_after_the_stamp(
+    name: str, values: np.ndarray, tmp_path: Path
+) -> None:
+    points = logs.street_points(np.random.default_rng(0), 4)
+    scan = one_cloud(tmp_path / "a.mcap", logs.xyz_rows(points, **{name: values}))
+    assert scan.time_offset is not None
+    expected = TIMES - 0.1 if values[0] < 0 else TIMES
+    np.testing.assert_allclose(scan.time_offset, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "values", [np.zeros(4), np.full(4, 12345.0), np.array([0, np.nan, 0.1, 0.2])]
+)
+def test_times_that_make_no_sense_are_no_times(values: np.ndarray, tmp_path: Path) -> None:
+    points = logs.street_points(np.random.default_rng(0), 4)
+    scan = one_cloud(tmp_path / "a.mcap", logs.xyz_rows(points, timestamp=values))
+    assert scan.time_offset is None
+
+
+# --- poses of every kind
+
+
+@pytest.mark.parametrize(
+    ("kind", "make"),
+    [
+        ("nav_msgs/msg/Odometry", logs.odometry),
+        ("geometry_msgs/msg/PoseStamped", logs.pose_stamped),
+        ("geometry_msgs/msg/PoseWithCovarianceStamped", logs.pose_with_covariance),
+        ("tf2_msgs/msg/TFMessage", lambda t, T: logs.transform(t, "map", "lidar", T)),
+    ],
+)
+def test_poses_of_every_type(kind: str, make: Any, tmp_path: Path) -> None:
+    points = logs.street_points(np.random.default_rng(0))
+    times = [START + i * SECOND // 10 for i in range(5)]
+    messages = [(t, "/where", kind, make(t, pose(x=t % 7, yaw=0.3))) for t in times]
+    path = logs.write(tmp_path / "a.mcap", [*messages, *(logs.cloud_at(t, points) for t in times)])
+    log = open_log(path)
+    assert log.pose_topic == "/where"
+    assert log.posed.all()
+    for t, T in zip(times, log.T_map_lidar, strict=True):
+        np.testing.assert_allclose(T, pose(x=t % 7, yaw=0.3), atol=1e-12)
+
+
+def test_static_transforms_lead_from_the_vehicle_to_the_lidar(tmp_path: Path) -> None:
+    T_base_mast, T_mast_lidar = pose(x=1.0, z=1.5, yaw=0.2), pose(y=0.3, z=0.4, yaw=-0.1)
+    T_map_base = pose(x=100.0, y=50.0, yaw=1.0)
+    T_lidar_mast = np.linalg.inv(T_mast_lidar)  # recorded against the direction of the chain
+    tf = "tf2_msgs/msg/TFMessage"
+    points = logs.street_points(np.random.default_rng(0))
+    path = logs.write(
+        tmp_path / "a.mcap",
+        [
+            (START, "/tf_static", tf, logs.transform(0, "base", "mast", T_base_mast)),
+            (START, "/tf_static", tf, logs.transform(0, "lidar", "mast", T_lidar_mast)),
+            logs.odometry_at(START, T_map_base, child="base"),
+            logs.cloud_at(START, points),
+        ],
+    )
+    log = open_log(path)
+    expected = T_map_base @ T_base_mast @ T_mast_lidar
+    np.testing.assert_allclose(log.T_map_lidar[0], expected, atol=1e-12)
+    assert any("base" in note and "static" in note for note in log.notes)
+
+
+def test_tf_composes_moving_and_static_transforms(tmp_path: Path) -> None:
+    tf = "tf2_msgs/msg/TFMessage"
+    points = logs.street_points(np.random.default_rng(0))
+    messages = [(START, "/tf_static", tf, logs.transform(0, "base", "lidar", pose(z=2.0, yaw=0.5)))]
+    for i in range(0, 11, 2):  # 5 Hz
+        t = START + i * SECOND // 10
+        messages.append((t, "/tf", tf, logs.transform(t, "map", "odom", pose(x=10.0, y=0.1 * i))))
+    for i in range(1, 9):  # 10 Hz, starts later, ends earlier
+        t = START + i * SECOND // 10
+        messages.append((t, "/tf", tf, logs.transform(t, "odom", "base", pose(x=float(i)))))
+    messages += [logs.cloud_at(START + i * SECOND // 10, points) for i in range(11)]
+    log = open_log(logs.write(tmp_path / "a.mcap", messages))
+    before, after = PoseStatus.BEFORE, PoseStatus.AFTER
+    assert log.pose_status.tolist() == [before, *[PoseStatus.POSED] * 8, after, after]
+    for i in range(1, 9):
+        expected = pose(x=10.0 + i, y=0.1 * i, z=2.0, yaw=0.5)
+        np.testing.assert_allclose(log.T_map_lidar[i], expected, atol=1e-9)
+
+
+def test_a_pose_without_a_frame_is_taken_as_the_lidars_and_it_says_so(tmp_path: Path) -> None:
+    points = logs.street_points(np.random.default_rng(0))
+    tf, posed = "tf2_msgs/msg/TFMessage", "geometry_msgs/msg/PoseStamped"
+    path = logs.write(
+        tmp_path / "a.mcap",
+        [
+            (START, "/tf_static", tf, logs.transform(0, "base", "lidar", pose(z=2.0))),
+            (START, "/pose", posed, logs.pose_stamped(START, pose(x=5.0))),
+            logs.cloud_at(START, points),
+        ],
+    )
+    log = open_log(path)
+    np.testing.assert_allclose(log.T_map_lidar[0], pose(x=5.0), atol=1e-12)
+    assert any("taken as those of the lidar" in note for note in log.notes)
+    named = open_log(path, pose_frame="base")
+    np.testing.assert_allclose(named.T_map_lidar[0], pose(x=5.0, z=2.0), atol=1e-12)
+
+
+def test_poses_in_the_map_go_before_others_however_many(tmp_path: Path) -> None:
+    points = logs.street_points(np.random.default_rng(0))
+    path = logs.write(
+        tmp_path / "a.mcap",
+        [
+            *(logs.odometry_at(START + i, pose(), "/wheels", frame="odom") for i in range(5)),
+            logs.odometry_at(START, pose(x=5.0), "/localization"),
+            logs.cloud_at(START, points),
+        ],
+    )
+    log = open_log(path)
+    assert log.pose_topic == "/localization"
+    assert any("/wheels" in note for note in log.notes)
+    assert open_log(path, pose_topic="/wheels").pose_topic == "/wheels"
+
+
+def test_the_topic_with_the_most_clouds_is_taken_and_noted(tmp_path: Path) -> None:
+    points = logs.street_points(np.random.default_rng(0))
+    messages = [
+        logs.odometry_at(START, pose()),
+        logs.cloud_at(START, points, "/map_cloud"),
+        logs.cloud_at(START, points),
+        logs.cloud_at(START, points),
+    ]
+    log = open_log(logs.write(tmp_path / "a.mcap", messages))
+    assert log.points_topic == "/points"
+    assert any("/map_cloud" in note for note in log.notes)
+    tie = logs.write(tmp_path / "tie.mcap", [*messages, messages[1]])
+    with pytest.raises(SourceError, match=r"/map_cloud, /points; name one as points_topic"):
+        open_log(tie)
+    assert len(open_log(tie, points_topic="/map_cloud")) == 2
+
+
+def test_scans_outside_of_the_poses_are_skipped_and_reported(tmp_path: Path) -> None:
+    points = logs.street_points(np.random.default_rng(0))
+    poses = [logs.odometry_at(START + i * SECOND, pose(x=2.0 * i)) for i in (1, 2, 5)]
+    scans = [logs.cloud_at(START + i * SECOND // 2, points) for i in range(12)]
+    path = logs.write(tmp_path / "a.mcap", [*poses, *scans])
+    log = open_log(path)
+    posed, gap = PoseStatus.POSED, PoseStatus.GAP
+    assert log.pose_status.tolist() == [
+        *[PoseStatus.BEFORE] * 2,
+        *[posed] * 3,
+        *[gap] * 5,
+        posed,
+        PoseStatus.AFTER,
+    ]
+    notes = "\n".join(log.notes)
+    for told in ("2 of 12 scans skipped: before", "1 of 12 scans skipped: after", "5 of 12"):
+        assert told in notes
+    found = [(s.stamp_ns - START) / SECOND for s in log.scans()]
+    assert found == [1.0, 1.5, 2.0, 5.0]
+    assert np.isnan(log.T_map_lidar[5]).all()
+    assert open_drive(path).info().points == 4 * 200
+    assert open_log(path, max_gap_s=3.0).posed.sum() == 9
+
+
+def test_scans_come_in_order_of_their_stamps(tmp_path: Path) -> None:
+    points = logs.street_points(np.random.default_rng(0))
+    late = [logs.cloud_at(START + i * SECOND // 10, points + i) for i in (2, 0, 1)]
+    poses = [logs.odometry_at(START + i * SECOND // 10, pose(x=float(i))) for i in (2, 1, 0)]
+    log = open_log(logs.write(tmp_path / "a.mcap", [*late, *poses]))
+    assert [(s.stamp_ns - START) * 10 // SECOND for s in log.scans()] == [0, 1, 2]
+    assert (np.diff(log.trajectory.stamps_ns) > 0).all()
+
+
+# --- written logs
+
+
+def made_scan(stamp_ns: int, seed: int, **without: None) -> Scan:
+    rng = np.random.default_rng(seed)
+    n = 300
+    more: dict[str, Any] = {
+        "intensity": rng.uniform(0, 255, n).astype(np.float32),
+        "ring": rng.integers(0, 16, n).astype(np.int32),
+        "time_offset": rng.uniform(0, 0.1, n).astype(np.float32).astype(float),
+    }
+    return Scan(stamp_ns, logs.street_points(rng, n), **{**more, **without})
+
+
+def made_poses(count: int = 5, step_ns: int = SECOND // 10) -> Trajectory:
+    stamps = START + np.arange(count) * step_ns
+    T = np.array([pose(x=3.9e6 + i, y=4e5, z=1.0, yaw=0.1 * i) for i in range(count)])
+    return Trajectory(stamps, T, "lidar")
+
+
+def test_a_written_log_reads_back(tmp_path: Path) -> None:
+    path, poses = tmp_path / "a.mcap", made_poses()
+    scans = [made_scan(int(stamp), i) for i, stamp in enumerate(poses.stamps_ns)]
+    write_log(path, scans, poses)
+    log = open_log(path)
+    assert log.notes == ()
+    np.testing.assert_allclose(log.T_map_lidar, poses.T_map_lidar, rtol=0, atol=1e-9)
+    for scan, found in zip(scans, log.scans(), strict=True):
+        np.testing.assert_array_equal(found.points, scan.points)
+        np.testing.assert_array_equal(found.intensity, scan.intensity)
+        np.testing.assert_array_equal(found.ring, scan.ring)
+        np.testing.assert_array_equal(found.time_offset, scan.time_offset)
+    assert all(m.header.frame_id == "lidar" for m in logs.decode(path, "/points"))
+    odometry = logs.decode(path, "/odometry")[2]
+    assert (odometry.header.frame_id, odometry.child_frame_id) == ("map", "lidar")
+    assert odometry.pose.pose.position.x == 3.9e6 + 2
+
+
+def test_a_scan_of_points_alone_reads_back(tmp_path: Path) -> None:
+    path, poses = tmp_path / "a.mcap", made_poses(1)
+    write_log(path, [made_scan(START, 0, intensity=None, ring=None, time_offset=None)], poses)
+    scan = next(open_log(path).scans())
+    assert scan.intensity is scan.ring is scan.time_offset is None
+
+
+def test_the_same_log_is_the_same_bytes(tmp_path: Path) -> None:
+    poses = made_poses()
+    contents = []
+    for name in ("a.mcap", "b.mcap"):
+        scans = [made_scan(int(stamp), i) for i, stamp in enumerate(poses.stamps_ns)]
+        write_log(tmp_path / name, scans, poses, truth=poses)
+        contents.append((tmp_path / name).read_bytes())
+    assert contents[0] == contents[1]
+
+
+def test_truth_is_a_topic_of_its_own_that_must_be_named(tmp_path: Path) -> None:
+    path, poses = tmp_path / "a.mcap", made_poses()
+    truth = Trajectory(poses.stamps_ns, poses.T_map_lidar + 0.0, "lidar")
+    truth.T_map_lidar[:, 1, 3] += 0.25
+    write_log(path, [made_scan(START, 0)], poses, truth=truth)
+    with pytest.raises(PoseError, match=r"/ground_truth, /odometry; name one as pose_topic"):
+        open_log(path)
+    assert open_log(path, pose_topic="/odometry").T_map_lidar[0, 1, 3] == 4e5
+    assert open_log(path, pose_topic="/ground_truth").T_map_lidar[0, 1, 3] == 4e5 + 0.25
+
+
+def test_a_log_given_up_half_way_does_not_read_as_whole(tmp_path: Path) -> None:
+    path, poses = tmp_path / "a.mcap", made_poses()
+
+    def interrupted() -> None:
+        with LogWriter(path) as log:
+            for i, stamp in enumerate(poses.stamps_ns.tolist()):
+                log.odometry(stamp, poses.T_map_lidar[i])
+                for _ in range(150):  # more than a chunk
+                    log.scan(made_scan(stamp, i))
+                if i == 3:
+                    raise RuntimeError("power cut")
+
+    with pytest.raises(RuntimeError, match="power cut"):
+        interrupted()
+    notes = "\n".join(open_log(path).notes)
+    assert "cut short" in notes
+
+
+def test_scans_out_of_order_are_not_written(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="a scan of"):
+        write_log(tmp_path / "a.mcap", [made_scan(START + 1, 0), made_scan(START, 1)], made_poses())
+
+
+def test_transforms_can_be_written(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with LogWriter(path) as log:
+        log.transform(START, "base", "lidar", pose(z=2.0), static=True)
+        for i in range(3):
+            log.transform(START + i * SECOND, "map", "base", pose(x=float(i)), static=False)
+        log.scan(made_scan(START + SECOND // 2, 0))
+    np.testing.assert_allclose(open_log(path).T_map_lidar[0], pose(x=0.5, z=2.0), atol=1e-12)

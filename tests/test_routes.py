@@ -1,0 +1,469 @@
+"""Routes from every format, at equal arc length; what is no route is refused."""
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from logs import SECOND, START, pose
+from pyproj import Transformer
+
+from tilestream.errors import (
+    CorruptSourceError,
+    CrsError,
+    PoseError,
+    SourceError,
+    SourceNotFoundError,
+    UnknownFormatError,
+    UsageError,
+)
+from tilestream.formats.routes import (
+    read_route,
+    read_routes,
+    resample,
+    route_of,
+    write_geojson_route,
+    write_tum,
+)
+from tilestream.records import Trajectory
+
+XYZ = np.array([[0.0, 0, 1], [30, 0, 1.5], [30, 40, 2], [-20, 40, 2]])
+
+
+def geojson(path: Path, *geometries: Any, **top: Any) -> Path:
+    features = [{"type": "Feature", "properties": None, "geometry": g} for g in geometries]
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": features, **top}))
+    return path
+
+
+def line(points: Any) -> dict[str, Any]:
+    return {"type": "LineString", "coordinates": np.asarray(points).tolist()}
+
+
+def as_tum(path: Path) -> Path:
+    rows = [f"{i}.5 {x} {y} {z} 0 0 0 1" for i, (x, y, z) in enumerate(XYZ)]
+    path.write_text("# stamp x y z\n\n" + "\n".join(rows))
+    return path
+
+
+def as_kitti(path: Path) -> Path:
+    path.write_text("\n".join(f"1 0 0 {x} 0 1 0 {y} 0 0 1 {z}" for x, y, z in XYZ))
+    return path
+
+
+def as_csv(path: Path) -> Path:
+    rows = [f"{i},{z},{y},{x}" for i, (x, y, z) in enumerate(XYZ)]
+    path.write_text("\ufeffid, Z_m ,north_m (local),East\n" + "\n".join(rows))
+    return path
+
+
+FORMATS: dict[str, Any] = {
+    "a.tum": as_tum,
+    "b.txt": as_tum,
+    "c.txt": as_kitti,
+    "d.csv": as_csv,
+    "e.geojson": lambda path: geojson(path, line(XYZ)),
+    "f.json": lambda path: path.write_text(json.dumps(line(XYZ))),
+}
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_gives_the_same_route(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    FORMATS[name](path)
+    route = read_route(path)
+    assert route.route_id == path.stem
+    np.testing.assert_array_equal(route.positions, XYZ)
+    steps = np.linalg.norm(np.diff(XYZ, axis=0), axis=1)
+    np.testing.assert_allclose(route.arc_length, [0, *np.cumsum(steps)])
+    assert route.heading[[0, 3]].tolist() == pytest.approx([0, np.pi])
+    assert route.heading[1] == pytest.approx(np.pi / 4, abs=1e-3)
+    assert (route.crs, route.dropped) == (None, 0)
+
+
+# --- real files
+
+
+def test_the_real_lane_centre_route(shared_data: Path) -> None:
+    path = shared_data / "shinjuku" / "route_nishishinjuku_local_m.csv"
+    route = read_route(path)
+    rows = list(csv.reader(path.read_text().splitlines()))[1:]
+    assert len(route.positions) == len(rows)
+    assert route.positions[0, :2].tolist() == [-938.87, -505.51]
+    assert np.isnan(route.positions[:, 2]).all()
+    np.testing.assert_allclose(route.arc_length, [float(r[0]) for r in rows], atol=0.05)
+    every_metre = resample(route)
+    assert len(every_metre.positions) == 2873
+    assert np.isnan(every_metre.positions[:, 2]).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "project_to", "lanelets"),
+    [
+        ("lanelet2_mapping_example_karlsruhe.osm", "EPSG:32632", 345),
+        ("lanelet2_kashiwanoha.osm", "EPSG:6677", 77),
+    ],
+)
+def test_real_lanelet2_maps(name: str, project_to: str, lanelets: int, shared_data: Path) -> None:
+    path = shared_data / "lanelet2" / name
+    with pytest.raises(CrsError, match=r"degrees, not metres.*project_to"):
+        read_routes(path)
+    routes = read_routes(path, project_to=project_to)
+    assert all(r.crs == project_to for r in routes)
+    ids = [number for r in routes for number in r.route_id.split("-")]
+    assert len(ids) == len(set(ids)) == lanelets
+    assert len(routes) < lanelets
+    assert all(1.0 < r.arc_length[-1] < 1000.0 for r in routes)
+    assert all(np.diff(r.arc_length).max() < 60.0 for r in routes)
+
+
+def test_a_real_log_is_a_route_without_height(shared_data: Path) -> None:
+    path = shared_data / "kitti_drive" / "drive.mcap"
+    route = read_route(path)
+    assert len(route.positions) == 52
+    assert np.isnan(route.positions[:, 2]).all()
+    assert route.arc_length[-1] == pytest.approx(71.45, abs=0.1)
+    lowered = read_route(path, z_offset=-1.73)
+    assert lowered.positions[0, 2] == -1.73
+
+
+# --- equal arc length
+
+
+def test_a_metre_apart_along_the_route() -> None:
+    route = route_of("r", np.array([[0.0, 0, np.nan], [10, 0, np.nan], [10, 5.5, np.nan]]))
+    every = resample(route)
+    assert every.arc_length.tolist() == list(range(16))
+    np.testing.assert_allclose(every.positions[:11, 0], np.arange(11))
+    np.testing.assert_allclose(every.positions[11:, 1], np.arange(1, 6))
+    np.testing.assert_allclose(every.heading[:10], 0.0, atol=1e-12)
+    assert every.heading[10] == pytest.approx(np.pi / 4)
+    np.testing.assert_allclose(every.heading[11:], np.pi / 2)
+
+
+@given(
+    st.lists(st.tuples(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3)), min_size=2, max_size=12),
+    st.sampled_from([5.0, 13.0]),
+)
+@settings(deadline=None)
+def test_points_lie_on_the_route_at_their_arc_length(
+    points: list[tuple[float, float]], spacing: float
+) -> None:
+    xyz = np.array([(x + 3.7e5, y + 3.95e6, np.nan) for x, y in points])
+    try:
+        route = route_of("r", xyz, max_jump=1e5)
+    except CorruptSourceError:
+        assert np.ptp(xyz[:, :2], axis=0).max() <= 0.01 * len(xyz)
+        return
+    if route.arc_length[-1] < spacing:
+        with pytest.raises(UsageError, match="spacing"):
+            resample(route, spacing)
+        return
+    every = resample(route, spacing)
+    np.testing.assert_allclose(np.diff(every.arc_length), spacing)
+    assert route.arc_length[-1] - every.arc_length[-1] < spacing * (1 + 1e-9)
+    segment = np.clip(np.searchsorted(route.arc_length, every.arc_length), 1, None)
+    segment = np.minimum(segment, len(route.arc_length) - 1)
+    a, b = route.positions[segment - 1, :2], route.positions[segment, :2]
+    begin, end = route.arc_length[segment - 1], route.arc_length[segment]
+    share = np.minimum((every.arc_length - begin) / (end - begin), 1.0)[:, None]
+    np.testing.assert_allclose(every.positions[:, :2], a + share * (b - a), atol=1e-6)
+    assert (np.abs(every.heading) <= np.pi).all()
+
+
+def test_height_is_part_of_the_length_where_there_is_one() -> None:
+    route = route_of("r", np.array([[0.0, 0, 0], [30, 0, 4], [60, 0, 8]]))
+    assert route.arc_length[-1] == pytest.approx(2 * np.hypot(30, 4))
+    np.testing.assert_allclose(resample(route).positions[10, 2], 10 * 4 / np.hypot(30, 4))
+
+
+# --- what a path may do, and may not
+
+
+def test_repeated_points_are_dropped_and_counted() -> None:
+    xyz = np.array([[0.0, 0, 0], [0, 0, 0], [5, 0, 0], [5.002, 0, 0], [5, 0.003, 0], [9, 0, 0]])
+    route = route_of("r", xyz)
+    assert route.positions[:, 0].tolist() == [0, 5, 9]
+    assert route.dropped == 3
+
+
+def test_slow_motion_is_no_repetition() -> None:
+    xyz = np.column_stack([np.arange(0, 5, 0.004), np.zeros(1250), np.zeros(1250)])
+    assert route_of("r", xyz).arc_length[-1] == pytest.approx(5.0, abs=0.02)
+
+
+def test_a_way_there_and_back_is_kept_and_the_heading_turns() -> None:
+    route = route_of("r", np.array([[0.0, 0, 0], [10, 0, 0], [0, 0, 0]]))
+    every = resample(route)
+    assert every.arc_length[-1] == 20
+    np.testing.assert_allclose(every.heading[:10], 0, atol=1e-12)
+    np.testing.assert_allclose(np.abs(every.heading[11:]), np.pi)
+    assert np.isfinite(every.heading).all()
+
+
+def test_a_jump_is_an_error_that_names_point_and_distance() -> None:
+    xyz = np.array([[0.0, 0, 0], [5, 0, 0], [5, 0, 0], [5, 4000, 0], [9, 4000, 0]])
+    with pytest.raises(PoseError, match=r"jumps 4000\.0 m from point 1 to point 3.*max_jump"):
+        route_of("r", xyz)
+    assert route_of("r", xyz, max_jump=5000.0).arc_length[-1] == 4009
+
+
+@pytest.mark.parametrize(
+    "degrees",
+    [
+        [[139.69, 35.69], [139.695, 35.695], [139.70, 35.70]],
+        [[8.4242, 49.0034], [8.4243, 49.0035]],
+        [[139.0 + 1e-4 * i, 35.0 + 2e-4 * i] for i in range(12_000)],
+        [[-0.1276, 51.507], [-0.1280, 51.508]],
+    ],
+)
+def test_degrees_are_refused_and_can_be_projected(degrees: Any, tmp_path: Path) -> None:
+    path = geojson(tmp_path / "a.geojson", line(degrees))
+    with pytest.raises(CrsError, match="degrees, not metres"):
+        read_routes(path)
+    with pytest.raises(CrsError, match="project_to = 'EPSG:4326' is in degrees"):
+        read_routes(path, project_to="EPSG:4326")
+    with pytest.raises(CrsError, match="no CRS"):
+        read_routes(path, project_to="nowhere")
+    zone = f"EPSG:{32600 + int((degrees[0][0] + 180) // 6) + 1}"
+    route = read_route(path, project_to=zone)
+    x, y = Transformer.from_crs("EPSG:4326", zone, always_xy=True).transform(*degrees[0])
+    np.testing.assert_allclose(route.positions[0, :2], [x, y])
+    assert route.crs == zone
+
+
+@pytest.mark.parametrize(
+    "metres",
+    [
+        [[0, 0], [3, 1], [8, 2]],
+        [[80.0 + 0.05 * i, -20.0] for i in range(60)],
+        [[458000, 5427900], [458000.5, 5427900.2]],
+    ],
+)
+def test_short_routes_in_metres_are_no_degrees(metres: Any, tmp_path: Path) -> None:
+    path = geojson(tmp_path / "a.geojson", line(metres))
+    assert read_route(path).arc_length[-1] > 0.5
+    with pytest.raises(CrsError, match="not in degrees"):
+        read_routes(path, project_to="EPSG:32654")
+
+
+def test_a_vehicle_that_stands_most_of_the_time_is_not_in_degrees(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    waits = rng.normal(0, 1e-4, 500)
+    drives = np.arange(0, 20, 0.1)
+    x = np.concatenate([waits, drives])
+    path = tmp_path / "a.tum"
+    path.write_text("\n".join(f"{i} {v} 3 0 0 0 0 1" for i, v in enumerate(x)))
+    assert read_route(path).arc_length[-1] == pytest.approx(19.9, abs=0.01)
+
+
+def test_what_the_file_says_of_its_crs_counts(tmp_path: Path) -> None:
+    def named(crs: str) -> dict[str, Any]:
+        return {"crs": {"type": "name", "properties": {"name": crs}}}
+
+    metric = geojson(tmp_path / "m.geojson", line(XYZ), **named("urn:ogc:def:crs:EPSG::6677"))
+    assert read_route(metric).crs == "urn:ogc:def:crs:EPSG::6677"
+    degrees = geojson(tmp_path / "d.geojson", line(XYZ / 2), **named("EPSG:4326"))
+    with pytest.raises(CrsError, match="degrees"):
+        read_route(degrees)
+    broken = geojson(tmp_path / "b.geojson", line(XYZ), crs="here")
+    with pytest.raises(CorruptSourceError, match="crs"):
+        read_route(broken)
+
+
+def test_the_names_of_columns_tell_degrees(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("lat,lon\n35.0,139.0\n36.5,139.0\n")
+    with pytest.raises(CrsError, match="degrees"):
+        read_route(path)
+
+
+def test_poses_of_a_camera_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "00.txt"
+    path.write_text("\n".join(f"1 0 0 {0.1 * i} 0 1 0 0.01 0 0 1 {2 * i}" for i in range(50)))
+    with pytest.raises(CorruptSourceError, match=r"climbs 98\.0 m.*z up"):
+        read_route(path)
+
+
+BAD: dict[str, tuple[str, str]] = {
+    "empty.tum": ("", "is empty"),
+    "comment.tum": ("# nothing\n", "is empty"),
+    "one.tum": ("1 0 0 0 0 0 0 1", "1 different points of 1"),
+    "still.tum": ("1 5 5 5 0 0 0 1\n2 5 5 5 0 0 0 1", "1 different points of 2"),
+    "seven.tum": ("1 0 0 0 0 0 0", "line 1 has 7 numbers"),
+    "ragged.txt": ("1 0 0 0 0 0 0 1\n\n2 0 0 0 0 0 0", "line 3 has 7 numbers"),
+    "word.tum": ("1 0 zero 0 0 0 0 1", "line 1 is no number: 'zero'"),
+    "nan.tum": ("1 0 0 0 0 0 0 1\n2 nan 0 0 0 0 0 1", "line 2 is not finite"),
+    "empty.csv": ("", "is empty"),
+    "noheader.csv": ("0,0\n10,0\n", "names no columns x and y"),
+    "nopoints.csv": ("x,y\n", "0 different points"),
+    "word.csv": ("x,y\n0,0\n1,far\n", "line 3, column y is no number: 'far'"),
+    "short.csv": ("x,y\n0,0\n1\n", "line 3, column y is no number: ''"),
+    "inf.csv": ("x,y\n0,0\n1,inf\n", "line 3, column y is not finite"),
+    "blank.csv": ("x,y\n0,0\n\n1,1\n", "line 3 is empty"),
+    "broken.geojson": ('{"type": ', "no GeoJSON"),
+    "list.geojson": ("[1, 2]", "no GeoJSON"),
+    "point.geojson": ('{"type": "Point", "coordinates": [1, 2]}', "no LineString but Point"),
+    "none.geojson": ('{"type": "FeatureCollection", "features": []}', "no geometry"),
+    "noline.geojson": ('{"type": "LineString", "coordinates": []}', "no coordinates"),
+    "null.geojson": ('{"type": "LineString", "coordinates": [[0, null]]}', "point 0 is no number"),
+    "flat.geojson": ('{"type": "LineString", "coordinates": [0, 1]}', "point 0 is no position"),
+    "nan.geojson": ('{"type": "LineString", "coordinates": [[0, NaN]]}', "point 0 is not finite"),
+    "broken.osm": ("<osm>", "no OSM XML"),
+    "none.osm": ("<osm/>", "no lanelets"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_is_no_route_is_refused_with_the_place(name: str, tmp_path: Path) -> None:
+    content, told = BAD[name]
+    path = tmp_path / name
+    path.write_text(content)
+    with pytest.raises(CorruptSourceError, match=told) as caught:
+        read_routes(path)
+    assert str(path) in str(caught.value)
+
+
+def test_points_with_and_without_height_do_not_mix(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    path.write_text('{"type": "LineString", "coordinates": [[0, 0, 1], [5, 0]]}')
+    with pytest.raises(CorruptSourceError, match="point 1 is not finite"):
+        read_route(path)
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(SourceNotFoundError, match="no such file"):
+        read_routes(tmp_path / "none.csv")
+    other = tmp_path / "route.gpx"
+    other.write_text("<gpx/>")
+    with pytest.raises(UnknownFormatError, match=r"\.gpx.*\.tum"):
+        read_routes(other)
+    binary = tmp_path / "route.csv"
+    binary.write_bytes(b"\xff\xfe\x00\x01\x80")
+    with pytest.raises(CorruptSourceError, match="not a text file"):
+        read_routes(binary)
+
+
+# --- several routes
+
+
+def test_several_routes_in_one_file(tmp_path: Path) -> None:
+    path = geojson(
+        tmp_path / "a.geojson",
+        line(XYZ),
+        {"type": "Point", "coordinates": [0, 0]},
+        {"type": "MultiLineString", "coordinates": [XYZ.tolist(), (XYZ + 5).tolist()]},
+    )
+    routes = read_routes(path)
+    assert [r.route_id for r in routes] == ["a", "a/2/0", "a/2/1"]
+    np.testing.assert_array_equal(routes[2].positions, XYZ + 5)
+    with pytest.raises(SourceError, match=r"more than one route.*a, a/2/0, a/2/1"):
+        read_route(path)
+    with pytest.raises(SourceError, match="no route 'b'"):
+        read_route(path, route_id="b")
+    assert read_route(path, route_id="a/2/1").route_id == "a/2/1"
+
+
+# --- Lanelet2
+
+
+def osm(path: Path, bounds: dict[int, tuple[list[int], list[int]]], **more: str) -> Path:
+    """Lanelets along x, 10 m per node: node n is at (10 n, 0); node 100 + n at (10 n, -4)."""
+    used = sorted({n for pair in bounds.values() for nodes in pair for n in nodes})
+    nodes = [
+        f'<node id="{n}" lat="35" lon="139"><tag k="local_x" v="{10 * (n % 100)}"/>'
+        f'<tag k="local_y" v="{-4 if n >= 100 else 0}"/><tag k="ele" v="2.5"/></node>'
+        for n in used
+    ]
+    ways, relations = [], []
+    for number, (left, right) in bounds.items():
+        for role, refs in (("1", left), ("2", right)):
+            nds = "".join(f'<nd ref="{n}"/>' for n in refs)
+            ways.append(f'<way id="{number}{role}">{nds}</way>')
+        relations.append(
+            f'<relation id="{number}"><member type="way" role="left" ref="{number}1"/>'
+            f'<member type="way" role="right" ref="{number}2"/><tag k="type" v="lanelet"/>'
+            f'<tag k="subtype" v="{more.get("subtype", "road")}"/></relation>'
+        )
+    path.write_text(f"<osm>{''.join([*nodes, *ways, *relations])}</osm>")
+    return path
+
+
+def test_centre_lines_join_where_there_is_no_fork(tmp_path: Path) -> None:
+    path = osm(
+        tmp_path / "a.osm",
+        {
+            3: ([2, 3], [102, 103]),
+            1: ([0, 1], [101, 100]),  # its right bound is drawn backwards
+            2: ([1, 2], [101, 102]),
+        },
+    )
+    (route,) = read_routes(path)
+    assert route.route_id == "1-2-3"
+    assert route.arc_length[-1] == pytest.approx(30.0)
+    np.testing.assert_allclose(route.positions[:, 1:], [[-2.0, 2.5]] * len(route.positions))
+    np.testing.assert_allclose(route.heading, 0.0, atol=1e-12)
+    assert route.crs is None
+
+
+def test_traffic_keeps_the_left_bound_on_its_left(tmp_path: Path) -> None:
+    # the bounds change roles: left is the one at y = -4, so traffic goes towards -x
+    (route,) = read_routes(osm(tmp_path / "a.osm", {1: ([100, 101], [0, 1])}))
+    np.testing.assert_allclose(np.abs(route.heading), np.pi)
+    assert route.positions[0, 0] == 10.0
+
+
+def test_a_fork_ends_a_route(tmp_path: Path) -> None:
+    path = osm(
+        tmp_path / "a.osm",
+        {1: ([0, 1], [100, 101]), 2: ([1, 2], [101, 102]), 3: ([1, 3], [101, 103])},
+    )
+    assert [r.route_id for r in read_routes(path)] == ["1", "2", "3"]
+
+
+def test_lanelets_that_no_vehicle_drives_or_that_are_broken(tmp_path: Path) -> None:
+    walk = osm(tmp_path / "walk.osm", {1: ([0, 1], [100, 101])}, subtype="crosswalk")
+    with pytest.raises(CorruptSourceError, match="no lanelets for vehicles"):
+        read_routes(walk)
+    short = osm(tmp_path / "short.osm", {7: ([0, 1], [100])})
+    with pytest.raises(CorruptSourceError, match="lanelet 7 has no right bound"):
+        read_routes(short)
+    lost = osm(tmp_path / "lost.osm", {7: ([0, 1], [100, 101])})
+    lost.write_text(lost.read_text().replace('<node id="101"', '<node id="999"'))
+    with pytest.raises(CorruptSourceError, match="node 101 is used and not there"):
+        read_routes(lost)
+
+
+# --- out
+
+
+def test_geojson_reads_back_to_the_bit(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    steps = rng.uniform(0.1, 2, (50, 3)) * np.array([1, 1, 0.1])
+    walk = np.cumsum(steps, axis=0) + np.array([3.7e5, 3.95e6, 40])
+    flat = walk.copy()
+    flat[:, 2] = np.nan
+    routes = [route_of(name, xyz, crs="EPSG:6677") for name, xyz in (("a", walk), ("b", flat))]
+    path = tmp_path / "a.geojson"
+    write_geojson_route(path, routes)
+    for route, found in zip(routes, read_routes(path), strict=True):
+        assert (found.route_id, found.crs) == (route.route_id, "EPSG:6677")
+        assert found.positions.tobytes() == route.positions.tobytes()
+    with pytest.raises(UsageError, match="different CRS"):
+        write_geojson_route(path, [routes[0], route_of("c", walk)])
+
+
+def test_tum_reads_back_to_the_bit(tmp_path: Path) -> None:
+    stamps = START + np.arange(5) * SECOND // 3
+    T = np.array([pose(x=3.7e5 + i / 3, y=3.95e6, z=0.1, yaw=0.2 * i) for i in range(5)])
+    path = tmp_path / "a.tum"
+    write_tum(path, Trajectory(stamps, T))
+    assert read_route(path).positions.tobytes() == T[:, :3, 3].tobytes()
+    rows = [r.split() for r in path.read_text().splitlines()[1:]]
+    found = [int(r[0].replace(".", "")) for r in rows]
+    assert found == stamps.tolist()
+    assert float(rows[2][7]) == pytest.approx(np.cos(0.2))
