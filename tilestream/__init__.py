@@ -6,8 +6,20 @@ scans -> 317 registrations each -------> error per sample point -----+-> forest 
 ```
 """
 
+from tilestream.config import RegistrationSettings as RegistrationSettings
+from tilestream.config import StartSettings as StartSettings
 from tilestream.dataflow.ingest_map import ingest as ingest
+from tilestream.dataflow.localize_drive import localize as localize
+from tilestream.formats.mcap import ScanSelection as ScanSelection
+from tilestream.localization import disc_starts as disc_starts
+from tilestream.localization import localization_error as localization_error
+from tilestream.localization import refined_pose as refined_pose
+from tilestream.localization import register as register
+from tilestream.localization import start_poses as start_poses
+from tilestream.ndt import cells_of as cells_of
 from tilestream.records import Cells as Cells
+from tilestream.records import LocalizationError as LocalizationError
+from tilestream.records import Registrations as Registrations
 from tilestream.sensors import HDL64 as HDL64
 from tilestream.sensors import OS1_128 as OS1_128
 from tilestream.sensors import VLP16 as VLP16

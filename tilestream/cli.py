@@ -12,23 +12,30 @@ from dataclasses import asdict
 from importlib import resources
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
+import pandas as pd
+import rich.progress
 import typer
 from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    ProgressColumn,
     TaskID,
     TextColumn,
     TimeRemainingColumn,
 )
 from rich.table import Table
+from rich.text import Text
 
-from tilestream.config import IngestSettings
+from tilestream.config import IngestSettings, RegistrationSettings, StartSettings
 from tilestream.dataflow import ingest_map
-from tilestream.dataflow.plan import DEFAULT_MEMORY, Plan, megabytes
+from tilestream.dataflow.localize_drive import localize as localize_drive
+from tilestream.dataflow.localize_drive import plan_localize
+from tilestream.dataflow.localize_tasks import Reading
+from tilestream.dataflow.plan import Plan, megabytes
 from tilestream.dataflow.run import Watch, dask_client
 from tilestream.dataflow.tasks import Outcome
 from tilestream.errors import (
@@ -42,6 +49,7 @@ from tilestream.errors import (
 from tilestream.formats import open_source
 from tilestream.formats.base import SourceInfo
 from tilestream.formats.mcap import ScanSelection
+from tilestream.records import TruePose
 from tilestream.store import POINTS, TileStore, open_store
 from tilestream.version import VERSION
 
@@ -54,6 +62,7 @@ app = typer.Typer(
 out = Console()
 err = Console(stderr=True)
 
+Matcher = Literal["default", "autoware"]
 SCHEDULER = typer.Option(help="Run on this Dask scheduler, e.g. tcp://10.0.0.1:8786.")
 WORKERS = typer.Option(min=1, help="Worker processes on this machine; 1: this process.")
 POINTS_TOPIC = typer.Option(help="Topic of the scans in a log; default: found by type.")
@@ -94,6 +103,15 @@ def parse_bytes(text: str) -> int:
     raise UsageError(f"{text!r} is no amount of memory: give a form like 512MB or 2GB")
 
 
+class Rate(ProgressColumn):
+    """How much of a stage ends per second."""
+
+    def render(self, task: rich.progress.Task) -> Text:
+        """The rate, empty before the first task has ended."""
+        rate = task.finished_speed or task.speed
+        return Text(f"{rate:,.1f}/s" if rate else "")
+
+
 @contextmanager
 def progress() -> Iterator[Watch]:
     """A progress bar per stage on stderr; failures are printed as they happen."""
@@ -101,6 +119,7 @@ def progress() -> Iterator[Watch]:
         TextColumn("{task.description:>8}"),
         BarColumn(),
         MofNCompleteColumn(),
+        Rate(),
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=err, transient=not err.is_terminal) as bar:
@@ -175,7 +194,7 @@ def ingest(
     offset: Annotated[int, OFFSET] = 0,
     from_s: Annotated[float, FROM_S] = 0.0,
     until_s: Annotated[float | None, UNTIL_S] = None,
-    memory: Annotated[str, MEMORY] = megabytes(DEFAULT_MEMORY).replace(" ", "").replace(",", ""),
+    memory: Annotated[str, MEMORY] = "1GB",
     scheduler: Annotated[str | None, SCHEDULER] = None,
     workers: Annotated[int, WORKERS] = 1,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan, do nothing.")] = False,
@@ -266,6 +285,113 @@ def info_table(found: SourceInfo) -> Table:
     table.add_row("CRS", found.crs or "none in the file")
     for note in found.notes:
         table.add_row("note", note)
+    return table
+
+
+@app.command()
+def localize(
+    store: Annotated[str, typer.Argument(help="The tile store.")],
+    log: Annotated[str, typer.Argument(help="An MCAP log with point clouds and poses.")],
+    folder: Annotated[str, typer.Option("--out", help="Folder of the tables.")],
+    cell_size: Annotated[float, typer.Option(help="Edge of an NDT cell [m].")] = 2.0,
+    spacing: Annotated[float, typer.Option(help="Distance between sample points [m].")] = 1.0,
+    matcher: Annotated[Matcher, typer.Option(help="Ours, or the production matcher.")] = "default",
+    scan_leaf: Annotated[float, typer.Option(help="Thin scans to one point per voxel [m].")] = 2.0,
+    radius: Annotated[float, typer.Option(help="Radius of the disc of starts [m].")] = 2.0,
+    step: Annotated[float, typer.Option(help="Spacing of the starts [m].")] = 0.2,
+    true_pose: Annotated[TruePose, typer.Option(help="As in the log, or refined.")] = "log",
+    beams: Annotated[int | None, typer.Option(help="As if by a lidar of n beams.")] = None,
+    max_range: Annotated[float | None, typer.Option(help="As if by one of this range [m].")] = None,
+    blind_rear: Annotated[float | None, typer.Option(help="As if blind at the rear [deg].")] = None,
+    deskew: Annotated[
+        bool, typer.Option("--deskew", help="Remove the motion's distortion.")
+    ] = False,
+    sweep: Annotated[
+        float | None, typer.Option(help="Duration of a turn [s], if no times.")
+    ] = None,
+    points_topic: Annotated[str | None, POINTS_TOPIC] = None,
+    pose_topic: Annotated[str | None, POSE_TOPIC] = None,
+    every: Annotated[int, EVERY] = 1,
+    offset: Annotated[int, OFFSET] = 0,
+    from_s: Annotated[float, FROM_S] = 0.0,
+    until_s: Annotated[float | None, UNTIL_S] = None,
+    starts_per_task: Annotated[
+        int | None, typer.Option(help="Split the starts; default: no.")
+    ] = None,
+    memory: Annotated[str, MEMORY] = "1GB",
+    scheduler: Annotated[str | None, SCHEDULER] = None,
+    workers: Annotated[int, WORKERS] = 1,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan, do nothing.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="For machines.")] = False,
+) -> None:
+    """Measure the localization error along a drive: 317 registrations per sample point."""
+    allowed = parse_bytes(memory)
+    preset = RegistrationSettings.autoware if matcher == "autoware" else RegistrationSettings
+    how: dict[str, Any] = {
+        "cell_size": cell_size,
+        "spacing": spacing,
+        "registration": preset(scan_leaf=scan_leaf),
+        "starts": StartSettings(radius=radius, step=step),
+        "true_pose": true_pose,
+        "scans": ScanSelection(every=every, offset=offset, from_s=from_s, until_s=until_s),
+        "starts_per_task": starts_per_task,
+        "memory": allowed,
+    }
+    reading = Reading(
+        log, points_topic, pose_topic, beams, max_range, blind_rear, deskew or bool(sweep), sweep
+    )
+    opened = open_store(store)
+    if dry_run:
+        out.print(plan_table(plan_localize(opened, reading, folder, **how)))
+        return
+    with dask_client(scheduler, workers, allowed) as client, progress() as watch:
+        labels = localize_drive(
+            opened, log, folder, **how, reading=reading, client=client, watch=watch
+        )
+    done = labels[labels["status"] == "done"]
+    if as_json:
+        print_json(error_facts(labels))
+    else:
+        out.print(error_table(labels))
+        out.print(f"The tables are in {folder}/errors and {folder}/starts", highlight=False)
+    if len(done) < len(labels):
+        failed = labels[labels["status"] == "failed"]
+        reasons = {f"scan {s}": r for s, r in zip(failed["scan"], failed["reason"], strict=True)}
+        raise PartialError(f"{log}: {len(failed)} of {len(labels)} scans failed:", reasons)
+
+
+THRESHOLDS = (0.10, 0.15, 0.20, 0.25)
+"""The paper's error thresholds [m] (its Table I)."""
+
+
+def error_facts(labels: pd.DataFrame) -> dict[str, float]:
+    """The errors of a drive in a few numbers: mean, median, tails [m], p_fail."""
+    done = labels[labels["status"] == "done"]
+    error = done["error_mean"]
+    return {
+        "sample_points": len(labels),
+        "failed": len(labels) - len(done),
+        "mean_m": float(error.mean()),
+        "median_m": float(error.median()),
+        "p95_m": float(error.quantile(0.95)),
+        "max_m": float(error.max()),
+        "p_fail": float(done["p_fail"].mean()),
+        "floor_m": float(done["error_floor"].mean()),
+        "tail_m": float(done["error_tail"].mean()),
+        **{f"share_over_{t:.2f}_m": float((error > t).mean()) for t in THRESHOLDS},
+    }
+
+
+def error_table(labels: pd.DataFrame) -> Table:
+    """The errors of a drive, and its worst places."""
+    table = Table(title="localization error", title_justify="left")
+    table.add_column("fact")
+    table.add_column("value", justify="right")
+    for name, value in error_facts(labels).items():
+        table.add_row(name, f"{value:.4g}" if isinstance(value, float) else f"{value:,}")
+    for row in labels.nlargest(3, "error_mean").itertuples():
+        place = f"worst: scan {row.scan} at {row.arc_length:.0f} m, ({row.x:.1f}, {row.y:.1f})"
+        table.add_row(place, f"{row.error_mean:.4g} m")
     return table
 
 

@@ -46,6 +46,11 @@ class ScatterTask:
     stage: str = "scatter"
 
     @property
+    def work(self) -> int:
+        """Points of the span (scans, of a log)."""
+        return self.span.stop - self.span.start
+
+    @property
     def key(self) -> str:
         """`scatter-<name>`."""
         return f"scatter-{self.name}"
@@ -64,6 +69,7 @@ class MergeTask:
     promised_bytes: int
     needs: tuple[str, ...] = ()
     stage: str = "merge"
+    work: int = 1
 
     @property
     def key(self) -> str:

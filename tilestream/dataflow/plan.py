@@ -29,6 +29,10 @@ class Task(Protocol):
         """Keys of the tasks that must be done before."""
 
     @property
+    def work(self) -> int:
+        """How much of its stage it is, in what the stage counts: tiles, scans, points."""
+
+    @property
     def promised_bytes(self) -> int:
         """Peak memory of a process that runs it [bytes], the interpreter included."""
 

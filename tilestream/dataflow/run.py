@@ -1,7 +1,7 @@
 """How tasks run: one by one in this process, or on Dask, with the same outcomes."""
 
 import uuid
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -15,7 +15,8 @@ IN_FLIGHT_PER_THREAD = 4
 """Tasks handed to Dask at a time, per thread of its workers."""
 
 Watch = Callable[[Outcome, int, int], None]
-"""Called after each task with its outcome, the tasks ended, and the tasks in all."""
+"""Called after each task: its outcome, how much of its stage has ended, how much that is in all
+(in what the stage counts: tiles, scans, points)."""
 
 
 def execute(tasks: Sequence[Task], client: Any | None, watch: Watch | None) -> list[Outcome]:
@@ -33,11 +34,17 @@ def execute(tasks: Sequence[Task], client: Any | None, watch: Watch | None) -> l
         The outcomes in the order of the tasks, whatever the order in which they ended.
     """
     ended: dict[str, Outcome] = {}
+    work = {task.key: task.work for task in tasks}
+    total: Counter[str] = Counter()
+    done: Counter[str] = Counter()
+    for task in tasks:
+        total[task.stage] += task.work
     run = _run_on_dask(client) if client is not None else _run_here
     for outcome in run(tasks, ended):
         ended[outcome.key] = outcome
+        done[outcome.stage] += work[outcome.key]
         if watch is not None:
-            watch(outcome, len(ended), len(tasks))
+            watch(outcome, done[outcome.stage], total[outcome.stage])
     return [ended[task.key] for task in tasks]
 
 
