@@ -17,6 +17,7 @@ from typing import Annotated, Any, Literal
 import pandas as pd
 import rich.progress
 import typer
+from rich.box import SIMPLE
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -46,7 +47,7 @@ from tilestream.errors import (
     TilestreamError,
     UsageError,
 )
-from tilestream.formats import open_source
+from tilestream.formats import describe
 from tilestream.formats.base import SourceInfo
 from tilestream.formats.mcap import ScanSelection
 from tilestream.records import TruePose
@@ -138,9 +139,10 @@ def progress() -> Iterator[Watch]:
 
 def tile_table(store: TileStore) -> Table:
     """The tiles of a store with status, counts and extents."""
-    table = Table(title=str(store), title_justify="left")
+    table = Table(title=str(store), title_justify="left", box=SIMPLE)
     for column in ("tile", "status", "points", "read", "lowest [m]", "highest [m]", "reason"):
-        table.add_column(column, justify="right" if column in ("points", "read") else "left")
+        right = column in ("points", "read")
+        table.add_column(column, justify="right" if right else "left", no_wrap=column != "reason")
     for key, mark in store.marks(POINTS).items():
         facts = mark.facts
         lowest, highest = (
@@ -154,7 +156,7 @@ def tile_table(store: TileStore) -> Table:
 
 def plan_table(plan: Plan) -> Table:
     """The stages of a plan with their tasks and promised memory."""
-    table = Table(title="plan", title_justify="left")
+    table = Table(title="plan", title_justify="left", box=SIMPLE)
     for column in ("stage", "tasks", "promised memory per task"):
         table.add_column(column, justify="left" if column == "stage" else "right")
     for stage, count, promise in plan.describe():
@@ -263,7 +265,7 @@ def info(
     as_json: Annotated[bool, typer.Option("--json", help="For machines.")] = False,
 ) -> None:
     """Show what is in a file or log: points, bounds, fields, topics, CRS."""
-    found = open_source(file).info()
+    found = describe(file)
     if as_json:
         print_json(asdict(found))
     else:
@@ -272,7 +274,7 @@ def info(
 
 def info_table(found: SourceInfo) -> Table:
     """What is in a file, a line per fact."""
-    table = Table(show_header=False, title=found.path, title_justify="left")
+    table = Table(show_header=False, title=found.path, title_justify="left", box=SIMPLE)
     table.add_row("format", found.format)
     table.add_row("size", f"{found.size_bytes:,} bytes")
     table.add_row(
@@ -384,7 +386,7 @@ def error_facts(labels: pd.DataFrame) -> dict[str, float]:
 
 def error_table(labels: pd.DataFrame) -> Table:
     """The errors of a drive, and its worst places."""
-    table = Table(title="localization error", title_justify="left")
+    table = Table(title="localization error", title_justify="left", box=SIMPLE)
     table.add_column("fact")
     table.add_column("value", justify="right")
     for name, value in error_facts(labels).items():

@@ -7,6 +7,7 @@ the label of a place is what 317 starts around the true pose end with.
 import logging
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,6 +35,8 @@ NEAR = 1.0
 """Starts within this distance of the true position make `error_floor` [m]."""
 FINE_CELL, FINE_RADIUS, FINE_STEP = 1.0, 0.5, 0.05
 """The refined true pose: cell size, search radius and step [m] (the paper's section VI)."""
+
+_AXES = ("along", "across", "up", "yaw")
 
 _log = logging.getLogger(__name__)
 
@@ -136,7 +139,7 @@ def register(
     if not align.signatures:
         _log.info("loading the registration kernels; the first time, compiling them for a minute")
     align(np.ascontiguousarray(points.T), corner - origin, local, rule, seven, limit, slots, out)
-    _require_hits(out.hits_at_start, starts)
+    _require_hits(out.lost, starts)
     T_map_lidar = starts.copy()
     T_map_lidar[:, :3, :3] = out.R
     T_map_lidar[:, :3, 3] = out.t + corner_m
@@ -192,7 +195,7 @@ def localization_error(
     )
 
 
-def start_errors(T_map_true: Float64, T_map_final: Float64) -> dict[str, Float64]:
+def start_errors(T_map_true: Float64, T_map_final: Float64) -> dict[str, Any]:
     """The error of each start, in the frame of the true heading.
 
     Args:
@@ -216,7 +219,7 @@ def start_errors(T_map_true: Float64, T_map_final: Float64) -> dict[str, Float64
     }
 
 
-def summary(errors: Mapping[str, Float64], distance: Float64) -> dict[str, float]:
+def summary(errors: Mapping[str, Float64], distance: Float64) -> dict[str, Any]:
     """The label of a sample point from the errors of its starts.
 
     Args:
@@ -235,7 +238,7 @@ def summary(errors: Mapping[str, Float64], distance: Float64) -> dict[str, float
         "mean_held": _mean(held),
         "median_held": float(np.median(held)) if held.size else math.nan,
         "p95_held": float(np.percentile(held, 95.0)) if held.size else math.nan,
-        **{f"{name}_mean": _mean(np.abs(errors[name])) for name in ("along", "across", "up", "yaw")},
+        **{f"{name}_mean": _mean(np.abs(errors[name])) for name in _AXES},
         "error_floor": error_floor,
         "error_tail": _mean(error) - error_floor,
     }
@@ -451,13 +454,13 @@ def _nothing_yet(R: Float64, t: Float64) -> Aligned:
         score=np.zeros(k),
         best=np.zeros(k),
         hits=np.zeros(k, np.int64),
-        hits_at_start=np.zeros(k, np.int64),
+        lost=np.zeros(k, np.bool_),
         hessian=np.zeros((k, 6, 6)),
     )
 
 
-def _require_hits(hits_at_start: Int64, starts: Float64) -> None:
-    lost = np.flatnonzero(hits_at_start == 0)
+def _require_hits(lost_starts: NDArray[np.bool_], starts: Float64) -> None:
+    lost = np.flatnonzero(lost_starts)
     if lost.size:
         place = ", ".join(f"{c:.1f}" for c in starts[lost[0], :3, 3])
         raise RegistrationError(

@@ -378,15 +378,16 @@ class TileStore:
             TileNotReadyError: a tile in the box failed or was skipped; says why.
             UsageError: as `Tile.cells`.
         """
+        cell_mm = whole_mm(cell_size, "cell_size")
+        self.grid.require_cell_size(cell_mm)
         tiles = [Tile(self, key) for key in self.grid.keys_over(box)]
         parts = [tile.cells(cell_size) for tile in tiles if tile.mark(POINTS).status != "missing"]
-        if not parts:
-            self.grid.require_cell_size(whole_mm(cell_size, "cell_size"))
-            return cells_of_mm(np.zeros((0, 3), np.int64), whole_mm(cell_size, "cell_size"))
-        columns = ("index", "count", "mean", "covariance")
         return Cells(
-            *(np.concatenate([getattr(part, name) for part in parts]) for name in columns),
-            cell_size=cell_size,
+            np.concatenate([np.zeros((0, 3), np.int64), *(part.index for part in parts)]),
+            np.concatenate([np.zeros(0, np.int64), *(part.count for part in parts)]),
+            np.concatenate([np.zeros((0, 3)), *(part.mean for part in parts)]),
+            np.concatenate([np.zeros((0, 3, 3)), *(part.covariance for part in parts)]),
+            cell_size,
         )
 
     def __repr__(self) -> str:

@@ -161,7 +161,6 @@ def _examine_all(
     found: dict[str, Source] = {}
     for pattern in [os.fspath(source) for source in sources]:
         try:
-            crs = open_source(pattern).info().crs if Path(pattern).is_dir() else None
             paths = expand_sources(pattern)
         except SourceNotFoundError:
             raise
@@ -171,13 +170,13 @@ def _examine_all(
         for path in paths:
             options = log_options if path.lower().endswith(".mcap") else {}
             absolute = str(Path(path).absolute())
-            found.setdefault(absolute, _examine(absolute, options, crs))
+            found.setdefault(absolute, _examine(absolute, options))
     if not found:
         raise UsageError("no sources: name at least one file, glob or map directory")
     return [found[path] for path in sorted(found)]
 
 
-def _examine(path: str, options: dict[str, Any], crs: str | None) -> Source:
+def _examine(path: str, options: dict[str, Any]) -> Source:
     """Open a source as far as its header; a failure is its reason, not an exception."""
     stat = Path(path).stat()
     readable = tuple(sorted(options.items()))
@@ -188,7 +187,7 @@ def _examine(path: str, options: dict[str, Any], crs: str | None) -> Source:
         spans = tuple(source.spans(POINTS_PER_TASK))
     except (SourceError, OSError) as error:
         return replace(known, reason=str(error))
-    return replace(known, info=replace(info, crs=info.crs or crs), spans=spans)
+    return replace(known, info=info, spans=spans)
 
 
 def _with_crs(settings: IngestSettings, found: Sequence[Source]) -> IngestSettings:

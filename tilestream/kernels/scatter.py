@@ -5,7 +5,6 @@ The lattice is that of the definitions, section 1: floor division of millimetres
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 SPLITMIX = np.uint64(0x9E3779B97F4A7C15)
 """2^64 / golden ratio, the increment of the splitmix64 generator (Steele et al. 2014)."""

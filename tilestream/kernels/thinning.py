@@ -67,7 +67,7 @@ def rehash(keys, sums, new_keys, new_sums):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def rounded_ratio(total, count):  # type: ignore[no-untyped-def]
-    """total / count in whole numbers, half to even; total >= 0, count > 0."""
+    """The ratio total / count in whole numbers, half to even; total >= 0, count > 0."""
     quotient = total // count
     twice = 2 * (total - quotient * count)
     if twice > count or (twice == count and quotient % 2 == 1):

@@ -1,0 +1,80 @@
+"""What the README shows works."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scenes import PLACES
+
+from tilestream.cli import run
+from tilestream.formats.las import write_las
+from tilestream.formats.pcd import write_pcd
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text()
+BLOCKS = re.findall(r"```(\w+)\n(.*?)```", README, flags=re.DOTALL)
+
+
+def block(containing: str) -> str:
+    (found,) = [text for _, text in BLOCKS if containing in text]
+    return found
+
+
+@pytest.fixture
+def street(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with the files that the README's examples name."""
+    points = PLACES["crossing"](np.random.default_rng(1), 60.0, 0.3)
+    points += (12.0 - points[:, 0].mean(), 34.0 - points[:, 1].mean(), 0.0)
+    write_pcd(tmp_path / "scan.pcd", points[::2])
+    (tmp_path / "blocks").mkdir()
+    write_las(tmp_path / "blocks" / "a.laz", points[1::2])
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_the_python_block_runs(street: Path) -> None:
+    names: dict[str, object] = {}
+    exec(block("import tilestream as ts"), names)
+    error = names["error"]
+    assert len(error.error) == 317
+    assert error.error_floor < 0.05
+
+
+def test_the_drive_block_runs(
+    shared_data: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture,
+) -> None:
+    (tmp_path / "drive.mcap").symlink_to(shared_data / "kitti_drive" / "drive.mcap")
+    monkeypatch.chdir(tmp_path)
+    text = block("--blind-rear").replace("\\\n", " ")
+    for line in text.strip().splitlines():
+        program, *arguments = line.split()
+        assert program == "tilestream"
+        if arguments[0] == "localize":
+            arguments += ["--spacing", "12"]
+        assert run(arguments) == 0
+    assert "mean_m" in capsys.readouterr().out
+
+
+def test_both_commands_are_one_line_each_and_ci_runs_the_second() -> None:
+    setups = [text for _, text in BLOCKS if "python3 -m venv" in text]
+    assert [text.count("\n") for text in setups] == [1, 1]
+    assert setups[0].endswith(".venv/bin/tilestream demo\n")
+    assert setups[1].endswith(".venv/bin/pytest\n")
+    assert r"grep -m 1 '\.venv/bin/pytest' README.md" in (ROOT / ".ci" / "run").read_text()
+
+
+def test_every_command_of_the_table_has_help() -> None:
+    for command in re.findall(r"^\| `tilestream (\w+)", README, flags=re.MULTILINE):
+        shown = subprocess.run(
+            [sys.executable, "-m", "tilestream", command, "--help"],
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert command in shown.stdout
