@@ -39,8 +39,8 @@ def execute(tasks: Sequence[Task], client: Any | None, watch: Watch | None) -> l
     done: Counter[str] = Counter()
     for task in tasks:
         total[task.stage] += task.work
-    run = _run_on_dask(client) if client is not None else _run_here
-    for outcome in run(tasks, ended):
+    frontier = Frontier(tasks)
+    for outcome in _run_here(frontier) if client is None else _run_on_dask(frontier, client):
         ended[outcome.key] = outcome
         done[outcome.stage] += work[outcome.key]
         if watch is not None:
@@ -48,51 +48,68 @@ def execute(tasks: Sequence[Task], client: Any | None, watch: Watch | None) -> l
     return [ended[task.key] for task in tasks]
 
 
-def _refusal(task: Task, ended: dict[str, Outcome]) -> Outcome | None:
-    """The outcome of a task whose need failed; None where it may run."""
-    for need in task.needs:
-        if need in ended and not ended[need].ok:
-            reason = f"not run, since {need} failed: {ended[need].reason}"
-            return Outcome(task.key, task.stage, None, reason)
-    return None
+class Frontier:
+    """The tasks that may run now, in their order, as outcomes come in."""
 
-
-def _run_here(tasks: Sequence[Task], ended: dict[str, Outcome]) -> Iterator[Outcome]:
-    for task in tasks:
-        yield _refusal(task, ended) or attempt(task)
-
-
-def _run_on_dask(
-    client: Any,
-) -> Callable[[Sequence[Task], dict[str, Outcome]], Iterator[Outcome]]:
-    def run(tasks: Sequence[Task], ended: dict[str, Outcome]) -> Iterator[Outcome]:
+    def __init__(self, tasks: Sequence[Task]) -> None:
         keys = {task.key for task in tasks}
-        waiting = deque(tasks)
-        running = distributed.as_completed(loop=client.loop)
-        by_future: dict[str, Task] = {}
-        here = uuid.uuid4().hex[:8]  # so that two runs on one scheduler never share a key
-        while waiting or by_future:
-            window = IN_FLIGHT_PER_THREAD * max(1, sum(client.nthreads().values()))
-            for _ in range(len(waiting)):
-                if len(by_future) >= window:
-                    break
-                task = waiting.popleft()
-                refusal = _refusal(task, ended)
-                if refusal is not None:
-                    yield refusal
-                elif all(need in ended or need not in keys for need in task.needs):
-                    stage, name = task.key.split("-", 1)
-                    future = client.submit(attempt, task, key=f"{stage}-{here}-{name}")
-                    by_future[future.key] = task
-                    running.add(future)
-                else:
-                    waiting.append(task)
-            if by_future:
-                future = next(running)
-                yield _outcome(by_future.pop(future.key), future)
-                future.release()
+        self._ready: deque[Task] = deque()
+        self._open: dict[str, int] = {}
+        self._after: dict[str, list[Task]] = {}
+        for task in tasks:
+            needs = keys.intersection(task.needs)
+            self._open[task.key] = len(needs)
+            for need in needs:
+                self._after.setdefault(need, []).append(task)
+            if not needs:
+                self._ready.append(task)
 
-    return run
+    def take(self) -> Task | None:
+        """The next task that may run; None where none may until another one has ended."""
+        return self._ready.popleft() if self._ready else None
+
+    def learn(self, outcome: Outcome) -> Iterator[Outcome]:
+        """Note an outcome; give those of the tasks that cannot run any more because of it."""
+        for task in self._after.pop(outcome.key, []):
+            if self._open[task.key] < 0:
+                continue
+            if outcome.ok:
+                self._open[task.key] -= 1
+                if self._open[task.key] == 0:
+                    self._ready.append(task)
+            else:
+                self._open[task.key] = -1
+                reason = f"not run, since {outcome.key} failed: {outcome.reason}"
+                refused = Outcome(task.key, task.stage, None, reason)
+                yield refused
+                yield from self.learn(refused)
+
+
+def _run_here(frontier: Frontier) -> Iterator[Outcome]:
+    while (task := frontier.take()) is not None:
+        outcome = attempt(task)
+        yield outcome
+        yield from frontier.learn(outcome)
+
+
+def _run_on_dask(frontier: Frontier, client: Any) -> Iterator[Outcome]:
+    running = distributed.as_completed(loop=client.loop)
+    by_future: dict[str, Task] = {}
+    here = uuid.uuid4().hex[:8]  # so that two runs on one scheduler never share a key
+    while True:
+        window = IN_FLIGHT_PER_THREAD * max(1, sum(client.nthreads().values()))
+        while len(by_future) < window and (task := frontier.take()) is not None:
+            stage, name = task.key.split("-", 1)
+            future = client.submit(attempt, task, key=f"{stage}-{here}-{name}")
+            by_future[future.key] = task
+            running.add(future)
+        if not by_future:
+            return
+        future = next(running)
+        outcome = _outcome(by_future.pop(future.key), future)
+        future.release()
+        yield outcome
+        yield from frontier.learn(outcome)
 
 
 def _outcome(task: Task, future: Any) -> Outcome:
@@ -124,7 +141,7 @@ def dask_client(scheduler: str | None, workers: int, memory: int) -> Iterator[An
                 memory_limit=2 * memory,
                 host="127.0.0.1",
                 dashboard_address="127.0.0.1:0",
-                env={"NUMBA_NUM_THREADS": "1"},
+                env={"NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
             ) as cluster,
             distributed.Client(cluster) as client,
         ):
