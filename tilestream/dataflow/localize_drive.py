@@ -1,6 +1,7 @@
 """The job that measures: a log and a map in, the localization error of every sample point out."""
 
 import os
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from tilestream.errors import PartialError, TileNotReadyError, UsageError
 from tilestream.formats.mcap import ScanLog, ScanSelection
 from tilestream.localization import FINE_CELL, start_poses
 from tilestream.records import TruePose
-from tilestream.store import POINTS, TileStore, hash_of
+from tilestream.store import TileStore, hash_of
 from tilestream.tables import read_tables
 from tilestream.tiling import TileKey, whole_mm
 
@@ -124,33 +125,39 @@ def plan_localize(
     reading = replace(reading, path=str(Path(reading.path).absolute()))
     log = reading.open()
     samples = choose_samples(log, scans, spacing)
-    keys = tiles_in_reach(store, log, samples, (reading.range_max or REACH) + MARGIN)
     measuring = Measuring(cell_size, true_pose, registration, starts, reading.as_sensor)
     sizes = {cell_size, FINE_CELL} if true_pose == "refined" else {cell_size}
-    cells: list[Task] = []
-    for size in sorted(sizes):
-        cell_mm = whole_mm(size, "cell_size")
-        store.grid.require_cell_size(cell_mm)
-        cells += [CellsTask(store.url, key, cell_mm) for key in keys]
-    made_from = hash_of(
-        [store.tile(key).require(POINTS).identity for key in keys],
-        file_state(reading.path),
-        repr(reading),
-        measuring.identity(),
-    )
-    tasks = list(cells)
+    for size in sizes:
+        store.grid.require_cell_size(whole_mm(size, "cell_size"))
+    have = {key: mark.identity for key, mark in store.marks().items() if mark.status == "done"}
+    reach = (reading.range_max or REACH) + MARGIN
+    cells: dict[str, Task] = {}
+    slices: list[Task] = []
     for first in range(0, len(samples), SCANS_PER_TASK):
-        tasks += _slice_tasks(
-            store,
-            reading,
-            measuring,
-            samples[first : first + SCANS_PER_TASK],
-            os.fspath(out),
-            made_from,
-            starts_per_task,
-            tuple(task.key for task in cells),
+        part = samples[first : first + SCANS_PER_TASK]
+        keys = tiles_in_reach(store, log, part, reach, have)
+        needed = {
+            task.key: task
+            for size in sorted(sizes)
+            for task in (CellsTask(store.url, key, whole_mm(size, "cell_size")) for key in keys)
+        }
+        cells |= needed
+        made_from = hash_of(
+            [have[key] for key in keys],
+            file_state(reading.path),
+            repr(reading),
+            measuring.identity(),
         )
-    return Plan(tuple(tasks), memory).check()
+        slices += _slice_tasks(
+            store, reading, measuring, part, os.fspath(out), made_from, starts_per_task, needed
+        )
+    if not cells:
+        x, y = log.T_map_lidar[samples[0].scan, :2, 3]
+        raise TileNotReadyError(
+            f"{store.url}: no tile within {reach:g} m of {log.path}, which begins at "
+            f"({x:.1f}, {y:.1f}) m: is the log in the map's frame?"
+        )
+    return Plan((*cells.values(), *slices), memory).check()
 
 
 def choose_samples(log: ScanLog, scans: ScanSelection, spacing: float) -> tuple[Sample, ...]:
@@ -178,23 +185,16 @@ def choose_samples(log: ScanLog, scans: ScanSelection, spacing: float) -> tuple[
 
 
 def tiles_in_reach(
-    store: TileStore, log: ScanLog, samples: tuple[Sample, ...], reach: float
+    store: TileStore,
+    log: ScanLog,
+    samples: Sequence[Sample],
+    reach: float,
+    have: Collection[TileKey],
 ) -> list[TileKey]:
-    """The tiles of the map that any of the scans may see, sorted.
-
-    Raises:
-        TileNotReadyError: there is none.
-    """
+    """Those of the tiles that the store has that any of the scans may see, sorted."""
     places = log.T_map_lidar[[sample.scan for sample in samples], :2, 3]
     touched = {key for at in places for key in store.grid.keys_over(box_around(at[None], reach))}
-    keys = sorted(touched.intersection(store.keys()))
-    if not keys:
-        (x, y) = places[0]
-        raise TileNotReadyError(
-            f"{store.url}: no tile within {reach:g} m of {log.path}, which begins at "
-            f"({x:.1f}, {y:.1f}) m: is the log in the map's frame?"
-        )
-    return keys
+    return sorted(touched.intersection(have))
 
 
 def _slice_tasks(
@@ -205,7 +205,7 @@ def _slice_tasks(
     out: str,
     made_from: str,
     starts_per_task: int | None,
-    needs: tuple[str, ...],
+    needs: Iterable[str],
 ) -> list[Task]:
     """The register tasks of a slice of scans, and the label task that sums them up."""
     count = len(start_poses(np.eye(4), measuring.starts))
@@ -219,7 +219,9 @@ def _slice_tasks(
         identity = hash_of(made_from, [s.scan for s in samples], batch)
         path = f"{out}/starts/{name}-{low:05d}.parquet"
         registers.append(
-            RegisterTask(store.url, reading, measuring, samples, batch, path, identity, needs)
+            RegisterTask(
+                store.url, reading, measuring, samples, batch, path, identity, tuple(needs)
+            )
         )
     label = LabelTask(
         samples,
