@@ -139,7 +139,7 @@ def register(
     if not align.signatures:
         _log.info("loading the registration kernels; the first time, compiling them for a minute")
     align(np.ascontiguousarray(points.T), corner - origin, local, rule, seven, limit, slots, out)
-    _require_hits(out.lost, starts)
+    _require_hits(out.hits, starts)
     T_map_lidar = starts.copy()
     T_map_lidar[:, :3, :3] = out.R
     T_map_lidar[:, :3, 3] = out.t + corner_m
@@ -454,18 +454,18 @@ def _nothing_yet(R: Float64, t: Float64) -> Aligned:
         score=np.zeros(k),
         best=np.zeros(k),
         hits=np.zeros(k, np.int64),
-        lost=np.zeros(k, np.bool_),
         hessian=np.zeros((k, 6, 6)),
     )
 
 
-def _require_hits(lost_starts: NDArray[np.bool_], starts: Float64) -> None:
-    lost = np.flatnonzero(lost_starts)
+def _require_hits(hits: Int64, starts: Float64) -> None:
+    """A start without a hit has nothing to step on, and none to stop at."""
+    lost = np.flatnonzero(hits == 0)
     if lost.size:
         place = ", ".join(f"{c:.1f}" for c in starts[lost[0], :3, 3])
         raise RegistrationError(
             f"the scan hits no cell from {lost.size} of {len(starts)} starts, "
-            f"the first at ({place}) (row {lost[0]}): the map has nothing there"
+            f"the first is row {lost[0]} at ({place}): the map has nothing there"
         )
 
 

@@ -12,9 +12,6 @@ Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]
 Int64 = NDArray[np.int64]
 
-SHIFT_BITS = 4
-"""Bits per axis of a packed shift; a shift s [anchor edges] is kept as s + 8."""
-
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _gap(mean, anchor):  # type: ignore[no-untyped-def]
@@ -22,13 +19,48 @@ def _gap(mean, anchor):  # type: ignore[no-untyped-def]
     return max(max(anchor - mean, mean - anchor - 1.0), 0.0)
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _pack(sx, sy, sz):  # type: ignore[no-untyped-def]
+    """A shift of -8 to 7 anchor edges per axis in 12 bits."""
+    return ((sx + 8) * 16 + sy + 8) * 16 + sz + 8
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def _lists(mean, dx, dy, dz, span, reach):  # type: ignore[no-untyped-def]
-    """Whether the anchor at (dx, dy, dz) from a cell's corner lists the cell."""
-    if reach == 0.0:
-        return abs(dx) + abs(dy) + abs(dz) <= span
-    x, y, z = _gap(mean[0], dx), _gap(mean[1], dy), _gap(mean[2], dz)
-    return x * x + y * y + z * z <= reach * reach
+def _costs(mean, span, reach, cost):  # type: ignore[no-untyped-def]
+    """Per axis and anchor around a cell's corner: faces away, or the squared gap to its mean.
+
+    An anchor lists the cell where the three add up to no more than what this returns.
+    """
+    for axis in range(3):
+        for k in range(2 * span + 1):
+            gap = _gap(mean[axis], k - span)
+            cost[axis, k] = gap * gap if reach > 0.0 else float(abs(k - span))
+    return reach * reach if reach > 0.0 else float(span)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _visit(corner, mean, shape, span, reach, count, cursor, cell, shift):  # type: ignore[no-untyped-def]
+    """Count the entries of every anchor, or, where `count` is empty, write them at `cursor`."""
+    width = 2 * span + 1
+    cost = np.empty((3, width))
+    for c in range(corner.shape[0]):
+        budget = _costs(mean[c], span, reach, cost)
+        for ij in range(width * width):
+            i, j = ij // width, ij % width
+            left = budget - cost[0, i] - cost[1, j]
+            if left < 0.0:
+                continue
+            a = (corner[c, 0] + i - span) * shape[1] + corner[c, 1] + j - span
+            a = a * shape[2] + corner[c, 2] - span
+            for k in range(width):
+                if cost[2, k] > left:
+                    continue
+                if count.size:
+                    count[a + k] += 1
+                    continue
+                at = cursor[a + k]
+                cell[at], shift[at] = c, _pack(span - i, span - j, span - k)
+                cursor[a + k] = at + 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -52,27 +84,13 @@ def neighbour_lists(
         (by rising row) and the packed shift from the anchor to the cell's corner.
     """
     first = np.zeros(shape[0] * shape[1] * shape[2] + 1, np.int32)
-    for filling in range(2):
-        if filling:
-            total = np.int32(0)
-            for a in range(first.size):
-                count = first[a]
-                first[a] = total
-                total += count
-            cell, shift = np.empty(total, np.int32), np.empty(total, np.int32)
-            cursor = first.copy()
-        for c in range(corner.shape[0]):
-            for dx in range(-span, span + 1):
-                for dy in range(-span, span + 1):
-                    for dz in range(-span, span + 1):
-                        if not _lists(mean[c], dx, dy, dz, span, reach):
-                            continue
-                        x, y, z = corner[c, 0] + dx, corner[c, 1] + dy, corner[c, 2] + dz
-                        a = (x * shape[1] + y) * shape[2] + z
-                        if filling:
-                            cell[cursor[a]] = c
-                            shift[cursor[a]] = ((8 - dx) * 16 + 8 - dy) * 16 + 8 - dz
-                            cursor[a] += 1
-                        else:
-                            first[a] += 1
+    none = first[:0]
+    _visit(corner, mean, shape, span, reach, first, none, none, none)
+    total = np.int32(0)
+    for a in range(first.size):
+        count = first[a]
+        first[a] = total
+        total += count
+    cell, shift = np.empty(total, np.int32), np.empty(total, np.int32)
+    _visit(corner, mean, shape, span, reach, none, first.copy(), cell, shift)
     return first, cell, shift

@@ -32,43 +32,58 @@ SINGULAR = 1e-12
 """The raw solver calls a matrix singular below this ratio of its pivots."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _packed(i, j):  # type: ignore[no-untyped-def]
-    """Where (i, j) of a symmetric 3x3 matrix is in xx xy xz yy yz zz."""
-    return min(i, j) * (5 - min(i, j)) // 2 + max(i, j)
+@njit(cache=True, nogil=True, error_model="numpy")
+def assemble(sums: Float64, g: Float64, H: Float64) -> None:
+    """Gradient (6,) and Hessian (6, 6) of the score from the sums of a pose.
+
+    The second derivative of a point is the symmetric part of e_i x (e_j x r).
+    """
+    for i in range(3):
+        g[i] = -sums[F + i]
+        for j in range(3):
+            H[i, 3 + j] = H[3 + j, i] = sums[K + 3 * i + j]
+    g[3] = sums[C + 5] - sums[C + 7]  # -(sum w r x f)_x = C_yz - C_zy
+    g[4] = sums[C + 6] - sums[C + 2]
+    g[5] = sums[C + 1] - sums[C + 3]
+    trace = sums[C] + sums[C + 4] + sums[C + 8]
+    k = 0
+    for i in range(3):
+        for j in range(i, 3):
+            twice = sums[C + 3 * i + j] + sums[C + 3 * j + i]
+            H[i, j] = H[j, i] = -sums[M + k]
+            H[3 + i, 3 + j] = H[3 + j, 3 + i] = -sums[N + k] - 0.5 * twice
+            k += 1
+        H[3 + i, 3 + i] += trace
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def assemble(sums: Float64, axes: Float64, euler: bool, g: Float64, H: Float64) -> None:
-    """Gradient (6,) and Hessian (6, 6) of the score from the sums of a pose.
+def to_euler(axes: Float64, g: Float64, H: Float64) -> None:
+    """Turn a gradient and Hessian for R <- Exp(w) R into those for the angles of R = Rx Ry Rz.
 
-    Rotations are about the columns a_i of `axes`: the identity for R <- Exp(w) R, or for the
-    Euler angles of R = Rx Ry Rz the axes ex, Rx ey, Rx Ry ez. The second derivative of a point is
-    a_i x (a_j x r), i the outer angle; for the exponential its symmetric part.
+    The columns a_i of `axes` are ex, Rx ey, Rx Ry ez: w = A (angles' rates). The second derivative
+    a_i x (a_j x r), i the outer angle, differs from its symmetric part by (a_i x a_j) x r / 2:
+    H_ij = a_i . H_w a_j + g_w . (a_i x a_j) / 2 for i < j.
     """
-    trace = sums[C] + sums[C + 4] + sums[C + 8]
+    old_g, old_H = g.copy(), H.copy()
     for i in range(3):
-        g[i], g[3 + i] = -sums[F + i], 0.0
+        g[3 + i] = 0.0
         for a in range(3):
-            b, c = (a + 1) % 3, (a + 2) % 3  # (sum w r x f)_a = C_cb - C_bc
-            g[3 + i] -= axes[a, i] * (sums[C + 3 * c + b] - sums[C + 3 * b + c])
+            g[3 + i] += axes[a, i] * old_g[3 + a]
         for j in range(3):
-            H[i, j] = -sums[M + _packed(i, j)]
             H[i, 3 + j] = 0.0
             for a in range(3):
-                H[i, 3 + j] += sums[K + 3 * i + a] * axes[a, j]
+                H[i, 3 + j] += old_H[i, 3 + a] * axes[a, j]
             H[3 + j, i] = H[i, 3 + j]
     for i in range(3):
         for j in range(i, 3):
-            first = dot = ij = ji = 0.0
+            value = 0.0
             for a in range(3):
-                dot += axes[a, i] * axes[a, j]
-                for b in range(3):
-                    first += axes[a, i] * sums[N + _packed(a, b)] * axes[b, j]
-                    ji += axes[a, j] * sums[C + 3 * a + b] * axes[b, i]
-                    ij += axes[a, i] * sums[C + 3 * a + b] * axes[b, j]
-            second = ji if euler else 0.5 * (ji + ij)
-            H[3 + i, 3 + j] = H[3 + j, 3 + i] = -first - (second - dot * trace)
+                b, c = (a + 1) % 3, (a + 2) % 3
+                cross = axes[b, i] * axes[c, j] - axes[c, i] * axes[b, j]
+                value += 0.5 * old_g[3 + a] * cross
+                for d in range(3):
+                    value += axes[a, i] * old_H[3 + a, 3 + d] * axes[d, j]
+            H[3 + i, 3 + j] = H[3 + j, 3 + i] = value
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from tilestream.kernels.newton import SUMS, M, assemble, definite_step, raw_step
+from tilestream.kernels.newton import SUMS, M, assemble, definite_step, raw_step, to_euler
 from tilestream.kernels.slots import FAR, LN4, best_of_cells, forget_rows, sums_at
 
 Float32 = NDArray[np.float32]
@@ -19,6 +19,8 @@ Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]
 Int64 = NDArray[np.int64]
 
+NO_SCORE = 1.0e-3
+"""Below this sum of densities it is worth counting whether a scan hits any cell."""
 SMALL_ANGLE = 1.0e-4
 """Euler angles below this [rad] count as 0 in the derivatives, as in PCL and Autoware."""
 
@@ -72,8 +74,6 @@ class Aligned(NamedTuple):
     """(k,) sum over points of their best cell's -d1 p."""
     hits: Int64
     """(k,) points with at least one cell."""
-    hits_at_start: Int64
-    """(k,) the same at the start."""
     hessian: Float64
     """(k, 6, 6) of the score at the final pose, for steps (tau, w) [m, rad]."""
 
@@ -118,6 +118,29 @@ def _from_euler(angles: Float64, ignored: float, R: Float64, axes: Float64) -> N
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _newton_step(rule, axes, g, H, d):  # type: ignore[no-untyped-def]
+    """The step `d` of a solver, from the gradient and Hessian for R <- Exp(w) R; its norm."""
+    if rule.euler:
+        to_euler(axes, g, H)
+    if rule.definite:
+        return definite_step(g, H, rule.step_max, d)
+    return raw_step(g, H, rule.step_max, 0.5 * rule.epsilon, d)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _move(rule, d, angles, R, t, axes):  # type: ignore[no-untyped-def]
+    """Apply a step to a pose."""
+    for i in range(3):
+        t[i] += d[i]
+    if rule.euler:
+        for i in range(3):
+            angles[i] += d[3 + i]
+        _from_euler(angles, 0.0, R, axes)
+    else:
+        _exponential(d[3:], R)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _scale(sums: Float64, d1: float) -> None:
     """Give the sums of kernels/slots.py their constants (see kernels/newton.py)."""
     for k in range(SUMS + 1):
@@ -131,56 +154,42 @@ def align(points, corner, local, rule, seven, limit, state, out):  # type: ignor
     Args:
         points: (3, n) scan in the lidar frame [m], float64.
         corner: (k, 3) the anchor, on the local grid, that `out.t` of each start counts from.
-        local: the cells around the scan.
-        rule: how to step.
+        local: the cells around the scan (a `LocalMap`).
+        rule: how to step (a `Rule`).
         seven: None for one slot per point, True for seven.
         limit: None, or the squared reach [m^2], float32.
         state: slots for n points, as `seven` says.
         out: starts in, results out.
     """
-    slots = 1 if seven is None else 7
+    slots = np.uint64(1) if seven is None else np.uint64(7)
     far = np.float32(FAR * local.edge)
     nearby = np.float32((0.1 * FAR * local.edge) ** 2) if limit is None else limit
     sums, g, H, d = np.empty(SUMS + 1), np.empty(6), np.empty((6, 6)), np.empty(6)
-    identity, axes, lever, angles = np.eye(3), np.eye(3), np.eye(3), np.empty(3)
+    axes, lever, angles = np.eye(3), np.eye(3), np.empty(3)
     for s in range(out.R.shape[0]):
         R, t = out.R[s], out.t[s]
         forget_rows(state, slots, far)
-        if rule.euler:
-            _euler_angles(R, angles)
-        hits_at_start = -1
-        norm = math.inf
-        steps = 0
-        while steps < rule.iterations_max and not norm < rule.epsilon:
+        _euler_angles(R, angles)
+        norm, steps, hits = math.inf, 0, 1
+        while steps < rule.iterations_max and not norm < rule.epsilon and hits > 0:
             if rule.euler:
                 _from_euler(angles, SMALL_ANGLE, lever, axes)
+                sums_at(state, points, R, lever, t, corner[s], local, seven, limit, sums)
             else:
-                lever[:] = R
-            sums_at(state, points, R, lever, t, corner[s], local, seven, limit, sums)
-            if steps == 0:
-                hits_at_start = best_of_cells(state, slots, nearby)[1]
+                sums_at(state, points, R, None, t, corner[s], local, seven, limit, sums)
+            if sums[SUMS] < NO_SCORE:
+                _, hits = best_of_cells(state, slots, nearby)
             _scale(sums, local.d1)
-            assemble(sums, axes, rule.euler, g, H)
-            if rule.definite:
-                norm = definite_step(g, H, rule.step_max, d)
-            else:
-                norm = raw_step(g, H, rule.step_max, 0.5 * rule.epsilon, d)
-            for i in range(3):
-                t[i] += d[i]
-            if rule.euler:
-                for i in range(3):
-                    angles[i] += d[3 + i]
-                _from_euler(angles, 0.0, R, axes)
-            else:
-                _exponential(d[3:], R)
+            assemble(sums, g, H)
+            norm = _newton_step(rule, axes, g, H, d)
+            _move(rule, d, angles, R, t, axes)
             steps += 1
-        sums_at(state, points, R, R, t, corner[s], local, seven, limit, sums)
+        sums_at(state, points, R, None, t, corner[s], local, seven, limit, sums)
         best, hits = best_of_cells(state, slots, nearby)
         _scale(sums, local.d1)
-        assemble(sums, identity, False, g, out.hessian[s])
+        assemble(sums, g, out.hessian[s])
         out.score[s] = sums[SUMS]
         out.best[s] = -local.d1 * best
         out.hits[s] = hits
-        out.hits_at_start[s] = hits if hits_at_start < 0 else hits_at_start
         out.iterations[s] = steps
         out.converged[s] = norm < rule.epsilon and hits > 0

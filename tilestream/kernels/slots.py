@@ -35,13 +35,17 @@ CELL = 9
 POINT = 6
 """Values of a row: u and r."""
 FAR = 1000.0
-"""Mean of the cell in an empty slot, along x, y and z [anchor edges]."""
+"""Mean of the cell in an empty slot along x [anchor edges]."""
 LN4 = 2.0 * math.log(2.0)
 """d2 over the factor of the inverse covariances, d2 / 2 log2(e)."""
 
 _BLOCK, _1 = np.uint64(BLOCK), np.uint64(STRIDE)
 _2, _3, _4, _5, _6, _7, _8, _CELL = (np.uint64(k * STRIDE) for k in (2, 3, 4, 5, 6, 7, 8, CELL))
+_T0, _T1, _T2, _T3, _T4, _T5, _T6, _T7, _T8 = (np.uint64(k) for k in range(CELL))
 _ZERO, _LN4 = np.float32(0.0), np.float32(LN4)
+
+EXACT_ENOUGH = {"contract", "nnan", "ninf", "nsz"}
+"""Fast math without reassociation."""
 
 
 class Slots(NamedTuple):
@@ -118,7 +122,7 @@ _LEAST = np.float32(-100.0)
 _MANTISSA = np.int32(23)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nnan", "ninf", "nsz"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=EXACT_ENOUGH)
 def _exp2(x):  # type: ignore[no-untyped-def]
     """2^x in float32 for x <= 0, 2^-100 below -100. Not reassociated: that undoes the rounding."""
     x = max(x, _LEAST)
@@ -223,13 +227,15 @@ def _reduce(cells, points, blocks, limit, seven, sums):  # type: ignore[no-untyp
         # fmt: on
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False, fastmath=EXACT_ENOUGH)
 def _locate(points, R, lever, t, corner, shape, edge, rows, anchor):  # type: ignore[no-untyped-def]
     """u, r and the anchor of every point.
 
     In float64, as x = R p + t [m] from the anchor corner `corner`: u does not lose digits with the
     distance from the scan's origin. Points outside the grid fall into its empty border.
+    `lever` is None, or another rotation than R to take r from.
     """
+    _wide_vectors()
     inverse = 1.0 / edge
     cx, cy, cz = float(corner[0]), float(corner[1]), float(corner[2])
     top_x, top_y, top_z = shape[0] - 1.0, shape[1] - 1.0, shape[2] - 1.0
@@ -237,26 +243,26 @@ def _locate(points, R, lever, t, corner, shape, edge, rows, anchor):  # type: ig
     r00, r01, r02 = R[0, 0], R[0, 1], R[0, 2]
     r10, r11, r12 = R[1, 0], R[1, 1], R[1, 2]
     r20, r21, r22 = R[2, 0], R[2, 1], R[2, 2]
-    l00, l01, l02 = lever[0, 0], lever[0, 1], lever[0, 2]
-    l10, l11, l12 = lever[1, 0], lever[1, 1], lever[1, 2]
-    l20, l21, l22 = lever[2, 0], lever[2, 1], lever[2, 2]
     tx, ty, tz = t[0], t[1], t[2]
-    n = points.shape[1]
-    for start in range(0, n, BLOCK):
-        own = np.uint64(start // BLOCK) * _6
-        for i in range(np.uint64(min(BLOCK, n - start))):
-            k, j = np.uint64(start) + i, own + i
+    n = np.uint64(points.shape[1])
+    for block in range((n + _BLOCK - np.uint64(1)) // _BLOCK):
+        own, begin = block * _6, block * _BLOCK
+        for i in range(min(_BLOCK, n - begin)):
+            k, j = begin + i, own + i
             px, py, pz = points[0, k], points[1, k], points[2, k]
             x = r00 * px + r01 * py + r02 * pz + tx
             y = r10 * px + r11 * py + r12 * pz + ty
             z = r20 * px + r21 * py + r22 * pz + tz
-            fx, fy, fz = math.floor(x * inverse), math.floor(y * inverse), math.floor(z * inverse)
+            fx, fy, fz = np.floor(x * inverse), np.floor(y * inverse), np.floor(z * inverse)
             rows[j] = x - fx * edge
             rows[j + _1] = y - fy * edge
             rows[j + _2] = z - fz * edge
-            rows[j + _3] = l00 * px + l01 * py + l02 * pz
-            rows[j + _4] = l10 * px + l11 * py + l12 * pz
-            rows[j + _5] = l20 * px + l21 * py + l22 * pz
+            if lever is None:
+                rows[j + _3], rows[j + _4], rows[j + _5] = x - tx, y - ty, z - tz
+            else:
+                rows[j + _3] = lever[0, 0] * px + lever[0, 1] * py + lever[0, 2] * pz
+                rows[j + _4] = lever[1, 0] * px + lever[1, 1] * py + lever[1, 2] * pz
+                rows[j + _5] = lever[2, 0] * px + lever[2, 1] * py + lever[2, 2] * pz
             ax = min(max(fx + cx, 0.0), top_x)
             ay = min(max(fy + cy, 0.0), top_y)
             az = min(max(fz + cz, 0.0), top_z)
@@ -264,79 +270,108 @@ def _locate(points, R, lever, t, corner, shape, edge, rows, anchor):  # type: ig
 
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False, inline="always")
-def _line(row, slot, slots):  # type: ignore[no-untyped-def]
-    """Where the cell of a slot begins: its first value; the others follow a line apart."""
-    return ((row // BLOCK) * slots + slot) * (CELL * STRIDE) + row % BLOCK
+def _slot(row, slots):  # type: ignore[no-untyped-def]
+    """Where the first slot of a row begins in `Slots.cells`; a slot takes `_CELL` more."""
+    return (row // _BLOCK) * (slots * _CELL) + row % _BLOCK
 
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-def _empty(cells, row, begin, slots, far):  # type: ignore[no-untyped-def]
-    """Empty the slots of a row from `begin` on; what they hold stays, far away."""
-    for slot in range(begin, slots):
-        k = _line(row, slot, slots)
-        cells[k] = cells[k + STRIDE] = cells[k + 2 * STRIDE] = far
+def _clear(cells, row, slots, far):  # type: ignore[no-untyped-def]
+    """Empty all slots of a row; the inverse covariances that they hold stay."""
+    k = _slot(row, slots)
+    for _ in range(slots):
+        cells[k] = far
+        k += _CELL
 
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-def _further_row(state, owner, slots, far):  # type: ignore[no-untyped-def]
-    """A row behind those of the points, for a point with more cells than slots."""
-    row = state.used[1]
+def _initialise(cells, used, slots, far):  # type: ignore[no-untyped-def]
+    """Fill the blocks in use that never were with empty slots."""
+    while used[2] * BLOCK < used[0]:
+        for row in range(np.uint64(used[2]) * _BLOCK, np.uint64(used[2] + 1) * _BLOCK):
+            k = _slot(row, slots)
+            for _ in range(slots):
+                cells[k], cells[k + _1], cells[k + _2] = far, _ZERO, _ZERO
+                cells[k + _3] = cells[k + _6] = cells[k + _8] = 1.0
+                cells[k + _4] = cells[k + _5] = cells[k + _7] = 0.0
+                k += _CELL
+        used[2] += 1
+
+
+@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+def _further_row(cells, used, owner, following, more, i, slots, far):  # type: ignore[no-untyped-def]
+    """A row behind those of the points, for point `i` that has more cells than slots."""
+    row = used[1]
     if row >= 0:
-        state.used[1] = state.following[row]
+        used[1] = following[row]
     else:
-        row = state.used[0]
-        state.used[0] = row + 1
-        _initialise(state, slots, far)
-    state.owner[row] = owner
-    state.following[row] = state.more[owner]
-    state.more[owner] = row
+        row = used[0]
+        used[0] += 1
+        _initialise(cells, used, slots, far)
+    owner[row] = i
+    following[row] = more[i]
+    more[i] = row
     return row
 
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-def _initialise(state, slots, far):  # type: ignore[no-untyped-def]
-    """Fill the blocks in use that never were with empty slots."""
-    while state.used[2] * BLOCK < state.used[0]:
-        for row in range(state.used[2] * BLOCK, (state.used[2] + 1) * BLOCK):
-            for slot in range(slots):
-                k = _line(row, slot, slots)
-                for value in range(CELL):
-                    diagonal = value in (3, 6, 8)
-                    cells_value = far if value < 3 else (1.0 if diagonal else 0.0)
-                    state.cells[k + value * STRIDE] = cells_value
-        state.used[2] += 1
+def _repack(state, local, slots, far):  # type: ignore[no-untyped-def]
+    """Copy the cells of its anchor into the slots of every point that moved to another one.
+
+    Means are taken from the anchor's corner, as u is.
+    """
+    cells, anchor, packed = state.cells, state.anchor, state.packed
+    more, owner, following, used = state.more, state.owner, state.following, state.used
+    first, cell, shift, table = local.first, local.cell, local.shift, local.table
+    edge = np.float32(local.edge)
+    for point in range(np.uint64(anchor.size)):
+        a = anchor[point]
+        if a == packed[point]:
+            continue
+        packed[point] = a
+        row = more[point]
+        while row >= 0:  # free its further rows
+            _clear(cells, np.uint64(row), slots, far)
+            after = following[row]
+            following[row] = used[1]
+            used[1] = row
+            row = after
+        more[point] = -1
+        k, slot = _slot(point, slots), np.uint64(0)
+        for entry in range(np.uint64(first[a]), np.uint64(first[a + 1])):
+            if slot == slots:
+                row = _further_row(cells, used, owner, following, more, point, slots, far)
+                k, slot = _slot(np.uint64(row), slots), np.uint64(0)
+            c, s = np.uint64(cell[entry]), shift[entry]
+            cells[k] = table[c, _T0] + np.float32((s >> 8) - 8) * edge
+            cells[k + _1] = table[c, _T1] + np.float32((s >> 4 & 15) - 8) * edge
+            cells[k + _2] = table[c, _T2] + np.float32((s & 15) - 8) * edge
+            cells[k + _3] = table[c, _T3]
+            cells[k + _4] = table[c, _T4]
+            cells[k + _5] = table[c, _T5]
+            cells[k + _6] = table[c, _T6]
+            cells[k + _7] = table[c, _T7]
+            cells[k + _8] = table[c, _T8]
+            k += _CELL
+            slot += np.uint64(1)
+        while slot < slots:
+            cells[k] = far
+            k += _CELL
+            slot += np.uint64(1)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-def _pack(state, i, first, cell, shift, table, edge, slots, far):  # type: ignore[no-untyped-def]
-    """Copy the cells of the anchor of point `i` into its slots; means from the anchor's corner."""
-    row = state.more[i]
-    while row >= 0:
-        following = state.following[row]
-        _empty(state.cells, row, 0, slots, far)
-        state.following[row] = state.used[1]
-        state.used[1] = row
-        row = following
-    state.more[i] = -1
-    a = state.anchor[i]
-    state.packed[i] = a
-    row, slot = i, 0
-    for entry in range(first[a], first[a + 1]):
-        if slot == slots:
-            row, slot = _further_row(state, i, slots, far), 0
-        c, s = np.uint64(cell[entry]), shift[entry]
-        k = np.uint64(_line(row, slot, slots))
-        state.cells[k] = table[c, 0] + ((s >> 8) - 8) * edge
-        state.cells[k + _1] = table[c, 1] + ((s >> 4 & 15) - 8) * edge
-        state.cells[k + _2] = table[c, 2] + ((s & 15) - 8) * edge
-        state.cells[k + _3] = table[c, 3]
-        state.cells[k + _4] = table[c, 4]
-        state.cells[k + _5] = table[c, 5]
-        state.cells[k + _6] = table[c, 6]
-        state.cells[k + _7] = table[c, 7]
-        state.cells[k + _8] = table[c, 8]
-        slot += 1
-    _empty(state.cells, row, slot, slots, far)
+def _copy_points(state):  # type: ignore[no-untyped-def]
+    """Give further rows the u and r of their point."""
+    points, owner = state.points, state.owner
+    for row in range(np.uint64(state.anchor.size), np.uint64(state.used[0])):
+        i = np.uint64(owner[row])
+        there = (row // _BLOCK) * _6 + row % _BLOCK
+        here = (i // _BLOCK) * _6 + i % _BLOCK
+        for _ in range(POINT):
+            points[there] = points[here]
+            there += _1
+            here += _1
 
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
@@ -345,8 +380,8 @@ def forget_rows(state, slots, far):  # type: ignore[no-untyped-def]
     n = state.anchor.size
     if state.used[0] == n:
         return
-    for row in range(n, state.used[0]):
-        _empty(state.cells, row, 0, slots, far)
+    for row in range(np.uint64(n), np.uint64(state.used[0])):
+        _clear(state.cells, row, slots, far)
     state.used[0], state.used[1] = n, -1
     state.packed[:] = -1
     state.more[:] = -1
@@ -355,23 +390,12 @@ def forget_rows(state, slots, far):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
 def sums_at(state, points, R, lever, t, corner, local, seven, limit, sums):  # type: ignore[no-untyped-def]
     """The sums of one pose (see `_reduce`), without constants, into `sums`."""
-    shape, edge, first = local.shape, local.edge, local.first
-    cell, shift, table = local.cell, local.shift, local.table
-    slots = 1 if seven is None else 7
-    far = np.float32(FAR * edge)
-    _initialise(state, slots, far)
-    _locate(points, R, lever, t, corner, shape, edge, state.points, state.anchor)
-    n = state.anchor.size
-    for i in range(n):
-        if state.anchor[i] != state.packed[i]:
-            _pack(state, i, first, cell, shift, table, edge, slots, far)
-    for row in range(n, state.used[0]):
-        i = state.owner[row]
-        there, here = (row // BLOCK) * POINT * STRIDE, (i // BLOCK) * POINT * STRIDE
-        for value in range(POINT):
-            state.points[there + row % BLOCK + value * STRIDE] = state.points[
-                here + i % BLOCK + value * STRIDE
-            ]
+    slots = np.uint64(1) if seven is None else np.uint64(7)
+    far = np.float32(FAR * local.edge)
+    _initialise(state.cells, state.used, slots, far)
+    _locate(points, R, lever, t, corner, local.shape, local.edge, state.points, state.anchor)
+    _repack(state, local, slots, far)
+    _copy_points(state)
     sums[:] = 0.0
     _reduce(state.cells, state.points, -(-state.used[0] // BLOCK), limit, seven, sums)
 
