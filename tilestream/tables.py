@@ -66,6 +66,16 @@ def read_mark(path: str) -> dict[str, Any] | None:
     return dict(json.loads(metadata[_MARK])) if _MARK in metadata else None
 
 
+def remove_others(keep: Sequence[str]) -> None:
+    """Remove what lies beside these tables in their folder: of other settings, or half-written."""
+    fs, place = fsspec.core.url_to_fs(keep[0])
+    folder = place.rsplit("/", 1)[0]
+    names = {path.rsplit("/", 1)[-1] for path in keep}
+    for path in [*fs.glob(f"{folder}/*.parquet"), *fs.glob(f"{folder}/*.part")]:
+        if str(path).rsplit("/", 1)[-1] not in names:
+            fs.rm_file(path)
+
+
 def read_tables(paths: Sequence[str]) -> pd.DataFrame:
     """The rows of tables of the same columns, one after the other.
 

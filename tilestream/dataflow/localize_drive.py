@@ -1,7 +1,7 @@
 """The job that measures: a log and a map in, the localization error of every sample point out."""
 
 import os
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,13 +28,13 @@ from tilestream.formats.mcap import ScanLog, ScanSelection
 from tilestream.localization import FINE_CELL, start_poses
 from tilestream.records import TruePose
 from tilestream.store import TileStore, hash_of
-from tilestream.tables import read_tables
+from tilestream.tables import read_tables, remove_others
 from tilestream.tiling import TileKey, whole_mm
 
 SCANS_PER_TASK = 8
 """Scans of a slice: about a second of work with 317 starts."""
-REACH = 120.0
-"""How far a scan is taken to see where nothing limits it [m]: what cells are made beforehand."""
+REACH = 250.0
+"""How far a scan is taken to see where nothing limits it [m]: as far as road lidars do."""
 
 
 def localize(
@@ -57,7 +57,8 @@ def localize(
     """Localize a drive in a map from many starts per sample point: what the error there is.
 
     One scan is taken per sample point. Scans are read slice by slice and registered by one task
-    per slice; a run that was killed continues when called again.
+    per slice; a run that was killed continues when called again. Tables of other scans or settings
+    in the same folder are removed, so that two data sets are never mixed.
 
     Args:
         store: the map.
@@ -100,6 +101,8 @@ def localize(
         starts_per_task=starts_per_task,
         memory=memory,
     )
+    for kind in (RegisterTask, LabelTask):
+        remove_others([task.out for task in plan.tasks if isinstance(task, kind)])
     outcomes = execute(plan.tasks, client, watch)
     failures = {outcome.key: outcome.reason for outcome in outcomes if not outcome.ok}
     if failures:
@@ -130,6 +133,7 @@ def plan_localize(
     for size in sizes:
         store.grid.require_cell_size(whole_mm(size, "cell_size"))
     have = {key: mark.identity for key, mark in store.marks().items() if mark.status == "done"}
+    log_state = hash_of(file_state(reading.path), repr(reading), measuring.identity())
     reach = (reading.range_max or REACH) + MARGIN
     cells: dict[str, Task] = {}
     slices: list[Task] = []
@@ -142,15 +146,18 @@ def plan_localize(
             for task in (CellsTask(store.url, key, whole_mm(size, "cell_size")) for key in keys)
         }
         cells |= needed
-        made_from = hash_of(
-            [have[key] for key in keys],
-            file_state(reading.path),
-            repr(reading),
-            measuring.identity(),
+        register = RegisterTask(
+            store_url=store.url,
+            reading=reading,
+            measuring=measuring,
+            samples=part,
+            batch=(0, len(start_poses(np.eye(4), starts))),
+            out=os.fspath(out),
+            map_state=hash_of([(str(key), have[key]) for key in keys]),
+            identity=log_state,
+            needs=tuple(needed),
         )
-        slices += _slice_tasks(
-            store, reading, measuring, part, os.fspath(out), made_from, starts_per_task, needed
-        )
+        slices += _slice_tasks(register, starts_per_task)
     if not cells:
         x, y = log.T_map_lidar[samples[0].scan, :2, 3]
         raise TileNotReadyError(
@@ -166,7 +173,7 @@ def choose_samples(log: ScanLog, scans: ScanSelection, spacing: float) -> tuple[
     Raises:
         UsageError: `spacing` is not positive, or no scan with a pose is selected.
     """
-    if not spacing > 0.0:
+    if not 0.0 < spacing < np.inf:
         raise UsageError(f"spacing is {spacing!r}: give a positive length in metres")
     chosen = scans.indices(log.stamps_ns)
     chosen = chosen[log.posed[chosen]]
@@ -197,36 +204,28 @@ def tiles_in_reach(
     return sorted(touched.intersection(have))
 
 
-def _slice_tasks(
-    store: TileStore,
-    reading: Reading,
-    measuring: Measuring,
-    samples: tuple[Sample, ...],
-    out: str,
-    made_from: str,
-    starts_per_task: int | None,
-    needs: Iterable[str],
-) -> list[Task]:
-    """The register tasks of a slice of scans, and the label task that sums them up."""
-    count = len(start_poses(np.eye(4), measuring.starts))
-    size = starts_per_task or count
+def _slice_tasks(whole: RegisterTask, starts_per_task: int | None) -> list[Task]:
+    """The register tasks of a slice of scans, and the label task that sums them up.
+
+    Args:
+        whole: all starts of the slice; its `out` is the folder of all tables, its `identity` that
+            of the log and the settings.
+        starts_per_task: starts of one task; None: all.
+    """
+    size = whole.batch[1] if starts_per_task is None else starts_per_task
     if size < 1:
         raise UsageError(f"starts_per_task is {size}: give at least 1")
-    name = f"{samples[0].scan:06d}"
+    name = f"{whole.samples[0].scan:06d}"
     registers = []
-    for low in range(0, count, size):
-        batch = (low, min(low + size, count))
-        identity = hash_of(made_from, [s.scan for s in samples], batch)
-        path = f"{out}/starts/{name}-{low:05d}.parquet"
-        registers.append(
-            RegisterTask(
-                store.url, reading, measuring, samples, batch, path, identity, tuple(needs)
-            )
-        )
+    for low in range(0, whole.batch[1], size):
+        batch = (low, min(low + size, whole.batch[1]))
+        identity = hash_of(whole.identity, whole.map_state, repr(whole.samples), batch)
+        path = f"{whole.out}/starts/{name}-{low:05d}.parquet"
+        registers.append(replace(whole, batch=batch, out=path, identity=identity))
     label = LabelTask(
-        samples,
+        whole.samples,
         tuple(task.out for task in registers),
-        f"{out}/errors/{name}.parquet",
+        f"{whole.out}/errors/{name}.parquet",
         hash_of([task.identity for task in registers]),
         tuple(task.key for task in registers),
     )

@@ -12,7 +12,7 @@ import pandas as pd
 from tilestream.config import RegistrationSettings, StartSettings
 from tilestream.dataflow.plan import BASE_BYTES
 from tilestream.dataflow.tasks import perform
-from tilestream.errors import PoseError, RegistrationError, TaskError
+from tilestream.errors import PoseError, RegistrationError, TaskError, UsageError
 from tilestream.formats.deskew import Sweep, deskew
 from tilestream.formats.lesser import as_lesser
 from tilestream.formats.mcap import ScanLog, open_log
@@ -24,6 +24,7 @@ from tilestream.localization import (
     start_poses,
     summary,
 )
+from tilestream.ndt import cells_of_mm
 from tilestream.records import Cells, Column, Float64, Scan, TruePose
 from tilestream.store import POINTS, Mark, TileStore, cells_table, hash_of, open_store
 from tilestream.tables import read_mark, read_tables, write_table
@@ -153,6 +154,16 @@ class Reading:
         ]
         return ", ".join(part for part in parts if part) or "as recorded"
 
+    def __post_init__(self) -> None:
+        """Refuse what no scan could be read as, before any task runs.
+
+        Raises:
+            UsageError: a number outside of its range.
+        """
+        self._lesser(Scan(0, np.zeros((0, 3))))
+        if self.sweep_s is not None and not 0.0 < self.sweep_s < math.inf:
+            raise UsageError(f"sweep is {self.sweep_s!r}: give a positive time in seconds")
+
     def open(self) -> ScanLog:
         """The log."""
         return open_log(self.path, points_topic=self.points_topic, pose_topic=self.pose_topic)
@@ -162,14 +173,15 @@ class Reading:
         if self.deskew:
             sweep = None if self.sweep_s is None else Sweep(self.sweep_s)
             scan = deskew(scan, log.trajectory, sweep=sweep)
-        if self.beams or self.range_max or self.blind_rear_deg:
-            scan = as_lesser(
-                scan,
-                beams=self.beams,
-                range_max=self.range_max,
-                blind_rear_deg=self.blind_rear_deg,
-            )
-        return scan
+        return self._lesser(scan)
+
+    def _lesser(self, scan: Scan) -> Scan:
+        return as_lesser(
+            scan,
+            beams=self.beams,
+            range_max=self.range_max,
+            blind_rear_deg=self.blind_rear_deg,
+        )
 
 
 @dataclass(frozen=True)
@@ -224,6 +236,8 @@ class RegisterTask:
     """First and last (exclusive) start."""
     out: str
     """Where the table goes."""
+    map_state: str
+    """Hash of the map around the slice."""
     identity: str
     """Hash of everything that the rows depend on."""
     needs: tuple[str, ...]
@@ -275,7 +289,7 @@ def _cells(task: CellsTask) -> Mark:
     known = tile.mark(name)
     if known.same_work(wanted):
         return known
-    cells = tile.cells(task.cell_mm / MM_PER_M)
+    cells = cells_of_mm(tile.points_mm(), task.cell_mm)
     columns = {
         "index": cells.index,
         "count": cells.count,
@@ -297,10 +311,11 @@ def _register(task: RegisterTask) -> int:
     facts: dict[int, dict[str, Any]] = {}
     scans = log.scans_at([sample.scan for sample in task.samples])
     for sample, scan in zip(task.samples, scans, strict=True):
+        place = _place(scan.T_map_lidar) if task.measuring.true_pose == "log" else {}
         try:
             found, fact = _register_scan(store, log, sample, scan, task)
-        except (RegistrationError, PoseError) as error:
-            facts[sample.number] = {"reason": str(error)}
+        except (RegistrationError, PoseError, UsageError) as error:
+            facts[sample.number] = place | {"reason": str(error)}
         else:
             rows.append(found)
             facts[sample.number] = fact | {"reason": ""}
@@ -315,9 +330,10 @@ def _register_scan(
 ) -> tuple[pd.DataFrame, dict[str, Any]]:
     """The rows of one scan, and what is true of all of them."""
     seen = task.reading.seen(scan, log)
-    T_map_true, measuring = _true_pose(store, seen, task.measuring), task.measuring
+    measuring = task.measuring
+    T_map_true = _true_pose(store, seen, task)
     starts = start_poses(T_map_true, measuring.starts)[slice(*task.batch)]
-    cells = _cells_around(store, seen, T_map_true, measuring.cell_size)
+    cells = _cells_around(store, seen, T_map_true, measuring.cell_size, task.map_state)
     found = register(cells, seen.points, starts, measuring.registration)
     rows = {
         "sample": sample.number,
@@ -329,29 +345,40 @@ def _register_scan(
         **{name: getattr(found, name) for name in ("converged", "iterations", "score", "nvtl")},
         "hits": found.hits,
     }
+    return pd.DataFrame(rows), _place(T_map_true) | {"points": found.points}
+
+
+def _place(T_map_true: Float64 | None) -> dict[str, float]:
+    assert T_map_true is not None  # `ScanLog.scans_at` gives scans that have a pose
     x, y, z = T_map_true[:3, 3].tolist()
-    heading = math.atan2(T_map_true[1, 0], T_map_true[0, 0])
-    return pd.DataFrame(rows), {"x": x, "y": y, "z": z, "heading": heading, "points": found.points}
+    return {"x": x, "y": y, "z": z, "heading": math.atan2(T_map_true[1, 0], T_map_true[0, 0])}
 
 
-def _true_pose(store: TileStore, scan: Scan, measuring: Measuring) -> Float64:
+def _true_pose(store: TileStore, scan: Scan, task: RegisterTask) -> Float64:
     assert scan.T_map_lidar is not None  # `ScanLog.scans_at` gives scans that have a pose
-    if measuring.true_pose == "log":
+    if task.measuring.true_pose == "log":
         return scan.T_map_lidar
-    cells = _cells_around(store, scan, scan.T_map_lidar, FINE_CELL)
+    cells = _cells_around(store, scan, scan.T_map_lidar, FINE_CELL, task.map_state)
     return refined_pose(cells, scan.points, scan.T_map_lidar)
 
 
-def _cells_around(store: TileStore, scan: Scan, T_map_lidar: Float64, cell_size: float) -> Cells:
+def _cells_around(
+    store: TileStore, scan: Scan, T_map_lidar: Float64, cell_size: float, map_state: str
+) -> Cells:
     """The cells of the tiles in reach of a scan."""
     ranges = np.linalg.norm(scan.points[:, :2], axis=1)
     reach = (float(ranges.max()) if ranges.size else 0.0) + MARGIN
     box = box_around(T_map_lidar[None, :2, 3], reach)
-    return _cells_of(store.url, tuple(store.grid.keys_over(box)), cell_size)
+    return _cells_of(store.url, tuple(store.grid.keys_over(box)), cell_size, map_state)
 
 
 @lru_cache(maxsize=2)
-def _cells_of(url: str, keys: tuple[TileKey, ...], cell_size: float) -> Cells:
+def _cells_of(
+    url: str,
+    keys: tuple[TileKey, ...],
+    cell_size: float,
+    map_state: str,  # noqa: ARG001 - the cells of a changed map are others
+) -> Cells:
     """One map of the cells of some tiles; successive scans mostly ask for the same."""
     store = open_store(url)
     low, high = store.grid.core(keys[0]), store.grid.core(keys[-1])
@@ -395,8 +422,8 @@ def _label(task: LabelTask) -> int:
         if mark is None:
             raise TaskError(f"{part} is gone: run the same command again")
         frame = pd.concat([frame, read_tables([part])], ignore_index=True)
-        for number, fact in mark["samples"].items():
-            facts[number] = fact if not fact["reason"] else facts.get(number, {}) | fact
+        for number, fact in mark["samples"].items():  # the first batch that failed decides
+            facts[number] = fact | {"reason": facts.get(number, fact)["reason"] or fact["reason"]}
         data_set = mark["data_set"]
     rows = []
     for sample in task.samples:
