@@ -113,11 +113,16 @@ def _run_on_dask(frontier: Frontier, client: Any) -> Iterator[Outcome]:
 
 
 def _outcome(task: Task, future: Any) -> Outcome:
-    """What became of a task on Dask; a worker that was lost too often is a failure too."""
-    if future.status == "finished":
+    """What became of a task on Dask; a worker that was lost too often is a failure too.
+
+    A result that was lost with its worker is waited for: Dask does the task again, which finds its
+    work marked as done.
+    """
+    try:
         outcome: Outcome = future.result()
-        return outcome
-    return Outcome(task.key, task.stage, None, f"{task.key} was lost: {future.exception()}")
+    except Exception as error:  # noqa: BLE001 - `attempt` never raises, so this is Dask's own
+        return Outcome(task.key, task.stage, None, f"lost by Dask: {error or future.status}")
+    return outcome
 
 
 @contextmanager
