@@ -136,7 +136,7 @@ def register(
     seven = None if settings.neighbours == "direct1" else True
     limit = np.float32(local.reach**2) if local.reach else None
     slots = empty_slots(len(points), 7 if seven else 1, int(np.diff(local.first).max()))
-    if not align.signatures:
+    if not getattr(align, "signatures", True):  # there are none under NUMBA_DISABLE_JIT
         _log.info("loading the registration kernels; the first time, compiling them for a minute")
     align(np.ascontiguousarray(points.T), corner - origin, local, rule, seven, limit, slots, out)
     _require_hits(out.hits, starts)
