@@ -65,7 +65,7 @@ def test_both_commands_are_one_line_each_and_ci_runs_the_second() -> None:
     setups = [text for _, text in BLOCKS if "python3 -m venv" in text]
     assert [text.count("\n") for text in setups] == [1, 1]
     assert setups[0].endswith(".venv/bin/tilestream demo\n")
-    assert setups[1].endswith(".venv/bin/pytest\n")
+    assert setups[1].endswith(".venv/bin/pytest -n auto --dist loadfile\n")
     assert r"grep -m 1 '\.venv/bin/pytest' README.md" in (ROOT / ".ci" / "run").read_text()
 
 
