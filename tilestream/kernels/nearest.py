@@ -17,7 +17,7 @@ STEPS_PER_SIGMA = 2.0**30
 
 @njit(cache=True, nogil=True, boundscheck=False)
 def group_by_cell(
-    cell_of_point: NDArray[np.int32], cells: int
+    cell_of_point: NDArray[np.int64], cells: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The points of each cell, by counting.
 
