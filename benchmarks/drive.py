@@ -1,0 +1,163 @@
+"""A real drive end to end: map from every second scan, the others localized from 317 starts each.
+
+    python benchmarks/drive.py [LOG] [--out FOLDER] [--workers N]
+
+As recorded, and as lesser sensors would have seen it, with the default and the production matcher.
+Prints the tables of RESULTS.md and draws benchmarks/figures/drive_errors.png (needs matplotlib).
+LOG is an MCAP log with point clouds and poses; default: the drive under TILESTREAM_DATA.
+"""
+
+import argparse
+import os
+import tempfile
+from pathlib import Path
+
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+
+import tilestream as ts
+from tilestream.dataflow.localize_tasks import Reading
+from tilestream.dataflow.plan import DEFAULT_MEMORY
+from tilestream.dataflow.run import dask_client
+
+mpl.use("Agg")
+HERE = Path(__file__).resolve().parent
+DATA = Path(os.environ.get("TILESTREAM_DATA", HERE.parents[1] / "shared" / "data"))
+FIGURE = HERE / "figures" / "drive_errors.png"
+MAPPED = ts.ScanSelection(every=2, offset=0)
+LOCALIZED = ts.ScanSelection(every=2, offset=1)
+MATCHERS = {
+    "definite": ts.RegistrationSettings(),
+    "autoware": ts.RegistrationSettings.autoware(),
+}
+SENSORS: dict[str, dict[str, float]] = {
+    "as recorded": {},
+    "16 beams, 30 m": {"beams": 16, "range_max": 30.0},
+    "16 beams, 30 m, rear 120 deg blind": {"beams": 16, "range_max": 30.0, "blind_rear_deg": 120.0},
+    "16 beams, 20 m, rear 180 deg blind": {"beams": 16, "range_max": 20.0, "blind_rear_deg": 180.0},
+    "16 beams, 15 m, rear 180 deg blind": {"beams": 16, "range_max": 15.0, "blind_rear_deg": 180.0},
+}
+WORST = 4
+"""Bad spots that are listed."""
+
+
+def measure(log: Path, folder: Path, workers: int) -> dict[tuple[str, str], pd.DataFrame]:
+    """The errors of the drive by sensor and matcher; what is there is not measured again."""
+    store = ts.ingest(log, folder / "map.zarr", scans=MAPPED)
+    print(store)
+    found = {}
+    with dask_client(None, workers, DEFAULT_MEMORY) as client:
+        for matcher, registration in MATCHERS.items():
+            for sensor, lesser in SENSORS.items():
+                found[sensor, matcher] = ts.localize(
+                    store,
+                    log,
+                    folder / matcher / sensor.replace(" ", "_").replace(",", ""),
+                    registration=registration,
+                    scans=LOCALIZED,
+                    reading=Reading(str(log), **lesser),  # type: ignore[arg-type]
+                    client=client,
+                )
+    return found
+
+
+def error_table(found: dict[tuple[str, str], pd.DataFrame]) -> str:
+    """Markdown: the label of all scans in a few numbers, a row per sensor and matcher."""
+    names = (
+        "sensor, matcher, points, mean [cm], median, p95, max, > 10 cm, > 15, > 20, > 25, p_fail"
+    )
+    lines = [f"| {names.replace(', ', ' | ')} | failed |", "|---" * 13 + "|"]
+    for (sensor, matcher), labels in found.items():
+        done = labels[labels["status"] == "done"]
+        error = 100.0 * done["error_mean"]
+        centimetres = (error.mean(), error.median(), error.quantile(0.95), error.max())
+        tails = ((error > limit).mean() for limit in (10.0, 15.0, 20.0, 25.0))
+        columns = [
+            *(sensor, matcher, f"{done['points'].mean():.0f}"),
+            *(f"{value:.1f}" for value in centimetres),
+            *(f"{100.0 * share:.0f} %" for share in tails),
+            *(f"{done['p_fail'].mean():.3f}", f"{len(labels) - len(done)} of {len(labels)}"),
+        ]
+        lines.append(f"| {' | '.join(columns)} |")
+    return "\n".join(lines)
+
+
+def worst_table(labels: pd.DataFrame) -> str:
+    """Markdown: where the error is largest, and in which direction."""
+    lines = [
+        "| scan | at | points | error | along | across | up | p_fail | converged | steps |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for row in labels.nlargest(WORST, "error_mean").to_dict("records"):
+        parts = (row[name] for name in ("error_mean", "along_mean", "across_mean", "up_mean"))
+        columns = [
+            *(str(row["scan"]), f"{row['arc_length']:.0f} m", str(row["points"])),
+            *(f"{100.0 * value:.1f} cm" for value in parts),
+            *(f"{row['p_fail']:.2f}", f"{row['converged']:.2f}", f"{row['iterations']:.1f}"),
+        ]
+        lines.append(f"| {' | '.join(columns)} |")
+    return "\n".join(lines)
+
+
+def draw(store: ts.TileStore, found: dict[str, pd.DataFrame]) -> None:
+    """The drive in its map, coloured by error, a panel per sensor, each with its own scale."""
+    points = np.concatenate([store.tile(key).points() for key in store.keys()])
+    labels = next(iter(found.values()))
+    low = labels[["x", "y"]].min().to_numpy() - 28.0
+    high = labels[["x", "y"]].max().to_numpy() + 28.0
+    seen = ((points[:, :2] > low) & (points[:, :2] < high)).all(axis=1) & (points[:, 2] > -1.2)
+    figure, panels = plt.subplots(1, len(found), figsize=(11.0, 4.4), layout="constrained")
+    for axes, (title, table) in zip(panels, found.items(), strict=True):
+        draw_panel(axes, points[seen][::2], table, title)
+        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="map x [m]")
+    panels[0].set_ylabel("map y [m]")
+    figure.savefig(FIGURE, dpi=80, pil_kwargs={"optimize": True})
+    print(f"{FIGURE}: {FIGURE.stat().st_size / 1e3:.0f} kB")
+
+
+def draw_panel(axes: Axes, points: np.ndarray, labels: pd.DataFrame, title: str) -> None:
+    """One drive in its map, the worst three places named."""
+    axes.scatter(points[:, 0], points[:, 1], s=0.15, c="0.8", linewidths=0, rasterized=True)
+    error = 100.0 * labels["error_mean"]
+    dots = axes.scatter(
+        labels["x"], labels["y"], c=error, s=42, cmap="viridis_r", edgecolors="k", linewidths=0.4
+    )
+    for place, row in enumerate(labels.nlargest(3, "error_mean").itertuples()):
+        axes.annotate(
+            f"scan {row.scan}: {100.0 * row.error_mean:.0f} cm",
+            (row.x, row.y),
+            xytext=(14, -22 - 14 * place),
+            textcoords="offset points",
+            fontsize=8,
+            arrowprops={"arrowstyle": "-", "lw": 0.5},
+        )
+    axes.get_figure().colorbar(
+        dots, ax=axes, location="bottom", shrink=0.8, label="mean 3D error [cm]"
+    )
+    axes.set_title(title, fontsize=10)
+    axes.set_aspect("equal")
+
+
+def main() -> None:
+    """Measure, print, draw."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("log", type=Path, nargs="?", default=DATA / "kitti_drive" / "drive.mcap")
+    parser.add_argument("--out", type=Path, help="keep map and tables here; continues there")
+    parser.add_argument("--workers", type=int, default=1, help="worker processes")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = arguments.out or Path(scratch)
+        found = measure(arguments.log, folder, arguments.workers)
+        print(f"\n{error_table(found)}")
+        for sensor in SENSORS:
+            print(f"\nworst, {sensor}, definite:\n\n{worst_table(found[sensor, 'definite'])}")
+        by_mean = {sensor: found[sensor, "definite"]["error_mean"].mean() for sensor in SENSORS}
+        chosen = ("as recorded", max(by_mean, key=by_mean.__getitem__))
+        draw(ts.open_store(str(folder / "map.zarr")), {s: found[s, "definite"] for s in chosen})
+
+
+if __name__ == "__main__":
+    main()
