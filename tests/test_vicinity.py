@@ -260,7 +260,7 @@ def check_image(points: Floats, sensor: Sensor, eyes: int) -> None:
     no_terms = {k: v[:0] for k, v in random_map(9)[1].items()}
     tiles = [tile_of(no_cells, no_terms, part, no_cells) for part in np.array_split(depth, 3)]
     along = np.linspace(-6, points[:, 0].max() - UTM[0] + 4, eyes)
-    places = np.column_stack([along, np.full(eyes, 1.3), np.full(eyes, 1.9)]) + UTM
+    places = np.column_stack([along, np.full(eyes, 1.3004), np.full(eyes, 1.9)]) + UTM
     sums = vicinity_sums(places, sensor, tiles)
     expected = [literal_image(view_from(world, place, sensor)).sum() for place in places]
     assert sums["occupied"].tolist() == expected
