@@ -8,9 +8,14 @@ scans -> 317 registrations each -------> error per sample point -----+-> forest 
 
 from tilestream.config import RegistrationSettings as RegistrationSettings
 from tilestream.config import StartSettings as StartSettings
+from tilestream.dataflow.factors_route import factors_along as factors_along
 from tilestream.dataflow.ingest_map import ingest as ingest
 from tilestream.dataflow.localize_drive import localize as localize
+from tilestream.factors.sample_points import sample_points as sample_points
+from tilestream.factors.table import factors as factors
 from tilestream.formats.mcap import ScanSelection as ScanSelection
+from tilestream.formats.routes import read_route as read_route
+from tilestream.formats.routes import read_routes as read_routes
 from tilestream.localization import disc_starts as disc_starts
 from tilestream.localization import localization_error as localization_error
 from tilestream.localization import refined_pose as refined_pose
@@ -20,6 +25,7 @@ from tilestream.ndt import cells_of as cells_of
 from tilestream.records import Cells as Cells
 from tilestream.records import LocalizationError as LocalizationError
 from tilestream.records import Registrations as Registrations
+from tilestream.records import Route as Route
 from tilestream.sensors import HDL64 as HDL64
 from tilestream.sensors import OS1_128 as OS1_128
 from tilestream.sensors import VLP16 as VLP16

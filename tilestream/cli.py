@@ -17,6 +17,7 @@ from typing import Annotated, Any, Literal
 import pandas as pd
 import rich.progress
 import typer
+import yaml
 from rich.box import SIMPLE
 from rich.console import Console
 from rich.progress import (
@@ -33,6 +34,8 @@ from rich.text import Text
 
 from tilestream.config import IngestSettings, RegistrationSettings, StartSettings
 from tilestream.dataflow import ingest_map
+from tilestream.dataflow.factors_route import factors_along, plan_factors
+from tilestream.dataflow.factors_tasks import Looking
 from tilestream.dataflow.localize_drive import localize as localize_drive
 from tilestream.dataflow.localize_drive import plan_localize
 from tilestream.dataflow.localize_tasks import Reading
@@ -47,10 +50,13 @@ from tilestream.errors import (
     TilestreamError,
     UsageError,
 )
+from tilestream.factors.catalogue import COLUMNS, Which
 from tilestream.formats import describe
 from tilestream.formats.base import SourceInfo
 from tilestream.formats.mcap import ScanSelection
+from tilestream.formats.routes import read_routes
 from tilestream.records import TruePose
+from tilestream.sensors import HDL64, OS1_128, VLP16, Sensor
 from tilestream.store import POINTS, TileStore, open_store
 from tilestream.version import VERSION
 
@@ -63,6 +69,7 @@ app = typer.Typer(
 out = Console()
 err = Console(stderr=True)
 
+SENSORS = {sensor.name: sensor for sensor in (VLP16, HDL64, OS1_128)}
 Matcher = Literal["default", "autoware"]
 SCHEDULER = typer.Option(help="Run on this Dask scheduler, e.g. tcp://10.0.0.1:8786.")
 WORKERS = typer.Option(min=1, help="Worker processes on this machine; 1: this process.")
@@ -360,6 +367,90 @@ def localize(
         failed = labels[labels["status"] == "failed"]
         reasons = {f"scan {s}": r for s, r in zip(failed["scan"], failed["reason"], strict=True)}
         raise PartialError(f"{log}: {len(failed)} of {len(labels)} scans failed:", reasons)
+
+
+@app.command()
+def factors(
+    store: Annotated[str, typer.Argument(help="The tile store.")],
+    route: Annotated[list[str], typer.Option(help="TUM, KITTI, CSV, GeoJSON, Lanelet2 or MCAP.")],
+    folder: Annotated[str, typer.Option("--out", help="Folder of the tables.")],
+    spacing: Annotated[float, typer.Option(help="Distance between sample points [m].")] = 1.0,
+    sensor: Annotated[str, typer.Option(help=f"{', '.join(SENSORS)}, or a YAML file.")] = "VLP16",
+    sensor_height: Annotated[float, typer.Option(help="Of the lidar above the road [m].")] = 2.0,
+    cell_size: Annotated[float, typer.Option(help="Edge of an NDT cell [m].")] = 2.0,
+    which: Annotated[Which, typer.Option(help="The paper's 20, their robust twins.")] = "all",
+    project_to: Annotated[str | None, typer.Option(help="CRS for routes in degrees.")] = None,
+    memory: Annotated[str, MEMORY] = "1GB",
+    scheduler: Annotated[str | None, SCHEDULER] = None,
+    workers: Annotated[int, WORKERS] = 1,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan, do nothing.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="For machines.")] = False,
+) -> None:
+    """Compute the factors of the map at every sample point of a route."""
+    allowed, opened = parse_bytes(memory), open_store(store)
+    routes = [found for path in route for found in read_routes(path, project_to=project_to)]
+    seen_by = SENSORS[sensor] if sensor in SENSORS else read_sensor(sensor)
+    if dry_run:
+        looking = Looking(seen_by, cell_size, which, sensor_height)
+        out.print(plan_table(plan_factors(opened, routes, folder, spacing, looking, allowed)))
+        return
+    with dask_client(scheduler, workers, allowed) as client, progress() as watch:
+        rows = factors_along(
+            opened,
+            routes,
+            folder,
+            spacing=spacing,
+            sensor=seen_by,
+            sensor_height=sensor_height,
+            cell_size=cell_size,
+            which=which,
+            client=client,
+            memory=allowed,
+            watch=watch,
+        )
+    counts = rows["status"].value_counts()
+    if as_json:
+        print_json({"sample_points": len(rows), **{str(k): int(v) for k, v in counts.items()}})
+    else:
+        out.print(factor_table(rows))
+        out.print(f"The tables are in {folder}/factors", highlight=False)
+    if counts.get("done", 0) < len(rows):
+        bad = rows[rows["status"] != "done"].groupby("reason").size()
+        reasons = {f"{count} sample points": str(reason) for reason, count in bad.items()}
+        raise PartialError(f"{store}: not every sample point has factors:", reasons)
+
+
+def read_sensor(path: str) -> Sensor:
+    """A sensor from a YAML file with the fields of `tilestream.Sensor`.
+
+    Raises:
+        UsageError: no such file or sensor, no mapping of fields, a field that cannot be.
+    """
+    if not Path(path).is_file():
+        raise UsageError(f"{path}: no such sensor or file; known are {', '.join(SENSORS)}")
+    try:
+        fields = yaml.safe_load(Path(path).read_text())
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path}: no YAML: {error}") from None
+    if not isinstance(fields, dict):
+        raise UsageError(f"{path}: give the fields of a sensor, e.g. range_max: 100.0")
+    return Sensor(**fields)
+
+
+def factor_table(rows: pd.DataFrame) -> Table:
+    """The factors of a route: how they are spread."""
+    table = Table(title=f"factors of {len(rows)} sample points", title_justify="left", box=SIMPLE)
+    table.add_column("factor")
+    for name in ("unit", "lowest", "median", "highest"):
+        table.add_column(name, justify="right")
+    for column in COLUMNS:
+        if column.name in rows:
+            values = rows[column.name]
+            spread = (values.min(), values.median(), values.max())
+            table.add_row(column.name, column.unit, *(f"{value:.4g}" for value in spread))
+    for status, count in rows["status"].value_counts().items():
+        table.add_row(f"{status}: {count}", "", "", "", "")
+    return table
 
 
 THRESHOLDS = (0.10, 0.15, 0.20, 0.25)

@@ -1,0 +1,140 @@
+"""The job that looks at the map: routes in, the factors of every sample point out."""
+
+import os
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from tilestream.dataflow.factors_tasks import FactorsTask, Looking, TermsTask, facts
+from tilestream.dataflow.localize_tasks import CellsTask, box_around
+from tilestream.dataflow.plan import DEFAULT_MEMORY, Plan, Task
+from tilestream.dataflow.run import Watch, execute
+from tilestream.errors import PartialError, UsageError
+from tilestream.factors.catalogue import Which
+from tilestream.factors.terms import reach_mm, terms_inputs
+from tilestream.formats.routes import resample
+from tilestream.records import Route
+from tilestream.sensors import VLP16, Sensor
+from tilestream.store import TileStore, hash_of
+from tilestream.tables import read_tables
+from tilestream.tiling import TileKey, whole_mm
+
+SENSOR_HEIGHT = 2.0
+"""Height of the lidar above the road [m] (the paper's vehicle)."""
+
+
+def factors_along(
+    store: TileStore,
+    routes: Iterable[Route],
+    out: str | os.PathLike[str],
+    *,
+    spacing: float = 1.0,
+    sensor: Sensor = VLP16,
+    sensor_height: float = SENSOR_HEIGHT,
+    cell_size: float = 2.0,
+    which: Which = "all",
+    client: Any | None = None,
+    memory: int = DEFAULT_MEMORY,
+    watch: Watch | None = None,
+) -> pd.DataFrame:
+    """The factors of sample points along routes, tile by tile, resumable, in parallel.
+
+    Args:
+        store: the map.
+        routes: where; in the map's frame, each with a name of its own.
+        out: folder of the tables, `factors/<tile>.parquet`, a local path or any fsspec URL.
+        spacing: distance between sample points [m].
+        sensor: what looks.
+        sensor_height: height of the lidar above the route, or above the ground where the route
+            has no z [m].
+        cell_size: edge of an NDT cell [m].
+        which: `faithful` (the paper's 20), `robust` (their twins), or `all`.
+        client: a Dask client to run on; None: this process.
+        memory: what a task may use [bytes].
+        watch: is told of each task that ended.
+
+    Returns:
+        A row per sample point, route by route and along each; `status` and `reason` say where
+        there are no factors.
+
+    Raises:
+        UsageError: no routes, two of one name, settings that cannot be.
+        PlanError: a task does not fit `memory`.
+        PartialError: some tasks failed; the message lists them, the rest is done.
+    """
+    routes = list(routes)
+    looking = Looking(sensor, cell_size, which, sensor_height)
+    plan = plan_factors(store, routes, out, spacing, looking, memory)
+    outcomes = execute(plan.tasks, client, watch)
+    failures = {o.key: o.reason for o in outcomes if not o.ok and o.stage == "factors"}
+    if failures:
+        raise PartialError(f"{out}: {len(failures)} tasks failed, the rest is done:", failures)
+    rows = read_tables([task.out for task in plan.tasks if isinstance(task, FactorsTask)])
+    order = {route.route_id: number for number, route in enumerate(routes)}
+    rows = rows.sort_values(["route_id", "sample"], key=lambda c: c.map(order).fillna(c))
+    return rows.reset_index(drop=True)
+
+
+def plan_factors(
+    store: TileStore,
+    routes: Sequence[Route],
+    out: str | os.PathLike[str],
+    spacing: float,
+    looking: Looking,
+    memory: int,
+) -> Plan:
+    """What `factors_along` will run; arguments and errors as there."""
+    names = tuple(route.route_id for route in routes)
+    if not names or len(set(names)) < len(names):
+        raise UsageError(
+            f"routes are named {', '.join(names) or 'nothing'}: give each its own name"
+        )
+    cell_mm = whole_mm(looking.cell_size, "cell_size")
+    store.grid.require_cell_size(cell_mm)
+    have = {key: mark.identity for key, mark in store.marks().items() if mark.status == "done"}
+    cells: dict[TileKey, Task] = {}
+    terms: dict[TileKey, Task] = {}
+    inputs: dict[TileKey, str] = {}
+    tasks: list[Task] = []
+    for tile, rows in sorted(_by_tile(store, routes, spacing).items()):
+        places = np.array([row[4:6] for row in rows])
+        reach = looking.sensor.range_max
+        seen = [k for k in store.grid.keys_over(box_around(places, reach)) if k in have]
+        for key in seen:
+            if key not in terms:
+                near = store.grid.keys_over(store.grid.core(key).grown(reach_mm(cell_mm)))
+                around = [k for k in near if k in have]
+                cells |= {k: CellsTask(store.url, k, cell_mm) for k in around if k not in cells}
+                needs = tuple(cells[k].key for k in around)
+                terms[key] = TermsTask(store.url, key, cell_mm, needs=needs)
+                inputs[key] = terms_inputs(store, key, cell_mm)
+        tasks.append(
+            FactorsTask(
+                store.url,
+                tile,
+                looking,
+                names,
+                tuple(rows),
+                hash_of(list(have.values())),
+                f"{os.fspath(out)}/factors/{tile}.parquet",
+                hash_of(facts(looking), names, rows, [inputs[key] for key in seen]),
+                tuple(terms[key].key for key in seen),
+            )
+        )
+    return Plan((*cells.values(), *terms.values(), *tasks), memory).check()
+
+
+def _by_tile(
+    store: TileStore, routes: Sequence[Route], spacing: float
+) -> dict[TileKey, list[tuple[int, int, float, float, float, float, float]]]:
+    """The sample points of all routes by the tile that holds them."""
+    found: dict[TileKey, list[tuple[int, int, float, float, float, float, float]]] = {}
+    for number, route in enumerate(routes):
+        points = resample(route, spacing)
+        columns = np.column_stack([points.arc_length, points.heading, points.positions])
+        for sample, row in enumerate(columns.tolist()):
+            key = store.grid.key_at(row[2], row[3])
+            found.setdefault(key, []).append((number, sample, *row))
+    return found

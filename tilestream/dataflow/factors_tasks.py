@@ -1,0 +1,169 @@
+"""The stages that look at the map: terms (of a tile's cells), factors (of its sample points)."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import pandas as pd
+
+from tilestream.dataflow.plan import BASE_BYTES
+from tilestream.dataflow.tasks import perform
+from tilestream.errors import TileNotReadyError
+from tilestream.factors.catalogue import COLUMNS, Which
+from tilestream.factors.sample_points import raised
+from tilestream.factors.table import TermsCache, factors
+from tilestream.factors.terms import terms_inputs, terms_table, tile_terms
+from tilestream.records import Column
+from tilestream.sensors import Sensor
+from tilestream.store import Mark, hash_of, open_store
+from tilestream.tables import read_mark, write_table
+from tilestream.tiling import MM_PER_M, TileKey
+from tilestream.version import VERSION
+
+TERMS_VERSION = 1
+"""Raise it when the terms that are made from the same points change."""
+FACTORS_VERSION = 1
+"""Raise it when the factors that are made from the same terms change."""
+TERMS_BYTES = 600_000_000
+"""Memory of a terms task beyond the interpreter: points of a tile, cells around it, pairs."""
+CACHE_BYTES = 300_000_000
+"""Memory for the terms of the tiles in sight of a factors task."""
+FACTORS_BYTES = CACHE_BYTES + 300_000_000
+"""Memory of a factors task beyond the interpreter: that, and the sums of some sample points."""
+
+PLACE_COLUMNS = (
+    Column("route_id", "place", "", "Name of the route.", "", dtype="str"),
+    Column("sample", "place", "1", "Number of the sample point on its route.", "", dtype="int64"),
+    Column("arc_length", "place", "m", "Length of the route up to here.", ""),
+    Column("heading", "place", "rad", "Direction of travel, from the map's x axis.", ""),
+    Column("x", "place", "m", "Place of the lidar.", "definitions, section 2"),
+    Column("y", "place", "m", "Place of the lidar.", "definitions, section 2"),
+    Column("z", "place", "m", "Place of the lidar: route or ground, plus its height.", "section 2"),
+)
+STATUS_COLUMNS = (
+    Column("status", "place", "", "done, missing or failed.", "", dtype="str"),
+    Column("reason", "place", "", "Why it is not done.", "", dtype="str"),
+)
+
+
+@dataclass(frozen=True)
+class TermsTask:
+    """Make the terms of one tile's cells."""
+
+    store_url: str
+    tile: TileKey
+    cell_mm: int
+    promised_bytes: int = BASE_BYTES + TERMS_BYTES
+    needs: tuple[str, ...] = ()
+    stage: str = "terms"
+    work: int = 1
+
+    @property
+    def key(self) -> str:
+        """`terms-<cell size in mm>-<tile>`."""
+        return f"terms-{self.cell_mm}-{self.tile}"
+
+
+@dataclass(frozen=True)
+class Looking:
+    """What factors are made with: the identity of a table of factors."""
+
+    sensor: Sensor
+    """What looks."""
+    cell_size: float
+    """Edge of a cell [m]."""
+    which: Which
+    """Which set of factors."""
+    sensor_height: float
+    """Height of the lidar above the ground or the route [m]."""
+
+
+@dataclass(frozen=True)
+class FactorsTask:
+    """Make the factors of the sample points that lie in one tile."""
+
+    store_url: str
+    tile: TileKey
+    looking: Looking
+    route_ids: tuple[str, ...]
+    samples: tuple[tuple[int, int, float, float, float, float, float], ...]
+    """(number of the route id, sample, arc length, heading, x, y, z of the route or NaN)."""
+    map_state: str
+    """Hash of the whole map: terms that a process holds are of this map only."""
+    out: str
+    identity: str
+    """Hash of everything that the rows depend on."""
+    needs: tuple[str, ...]
+    promised_bytes: int = BASE_BYTES + FACTORS_BYTES
+    stage: str = "factors"
+
+    @property
+    def work(self) -> int:
+        """Sample points."""
+        return len(self.samples)
+
+    @property
+    def key(self) -> str:
+        """`factors-<tile>`."""
+        return f"factors-{self.tile}"
+
+
+@perform.register
+def _terms(task: TermsTask) -> Mark:
+    store = open_store(task.store_url)
+    tile, name = store.tile(task.tile), terms_table(task.cell_mm)
+    inputs = terms_inputs(store, task.tile, task.cell_mm)
+    wanted = Mark("done", inputs=inputs, settings=hash_of(task.cell_mm, TERMS_VERSION))
+    known = tile.mark(name)
+    if known.same_work(wanted):
+        return known
+    try:
+        terms = tile_terms(store, task.tile, task.cell_mm / MM_PER_M)
+    except TileNotReadyError as error:
+        failed = Mark("failed", str(error), inputs, wanted.settings)
+        tile.write_reason(name, failed)  # the sample points that see it say so in their rows
+        return failed
+    made = Mark("done", "", inputs, wanted.settings, VERSION, {"cells": len(terms.mean)})
+    tile.write_table(name, terms.arrays(), made)
+    return made
+
+
+@perform.register
+def _factors(task: FactorsTask) -> int:
+    """Rows written; 0 where they were there."""
+    mark = read_mark(task.out)
+    if mark is not None and mark["identity"] == task.identity:
+        return 0
+    store, looking = open_store(task.store_url), task.looking
+    columns = zip(*task.samples, strict=True)
+    frame = pd.DataFrame(dict(zip(_SAMPLE_FIELDS, columns, strict=True)))
+    frame["route_id"] = [task.route_ids[number] for number in frame.pop("route")]
+    positions = raised(frame[["x", "y", "z"]].to_numpy(), store, looking.sensor_height)
+    frame["z"] = positions[:, 2]
+    cache = _cache(task.store_url, looking.cell_size, task.map_state)
+    found = factors(store, positions, looking.sensor, looking.cell_size, looking.which, cache)
+    frame = pd.concat([frame[[column.name for column in PLACE_COLUMNS]], found], axis=1)
+    documented = (*PLACE_COLUMNS, *COLUMNS, *STATUS_COLUMNS)
+    write_table(
+        task.out, frame, documented, {"identity": task.identity, "data_set": facts(looking)}
+    )
+    return len(frame)
+
+
+_SAMPLE_FIELDS = ("route", "sample", "arc_length", "heading", "x", "y", "z")
+
+
+@lru_cache(maxsize=1)
+def _cache(url: str, cell_size: float, map_state: str) -> TermsCache:  # noqa: ARG001 - part of the key
+    """The terms that this process holds for the tasks that follow."""
+    return TermsCache(open_store(url), cell_size, CACHE_BYTES)
+
+
+def facts(looking: Looking) -> dict[str, object]:
+    """What is kept with every table of factors: two that differ in it are never mixed."""
+    return {
+        "sensor": looking.sensor.model_dump(),
+        "cell_size": looking.cell_size,
+        "which": looking.which,
+        "sensor_height": looking.sensor_height,
+        "versions": [TERMS_VERSION, FACTORS_VERSION, VERSION],
+    }
