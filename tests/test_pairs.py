@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tilestream.kernels.near_cells import cells_around, neighbours_within
+from tilestream.kernels.neighbours import cells_around, neighbours_within
 from tilestream.kernels.pairs import (
     bhattacharyya_sums,
     entropy_of_counts,

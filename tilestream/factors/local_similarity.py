@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tilestream.factors.vicinity import Sums, Terms, ratio
 from tilestream.kernels.density import magnusson_constants
-from tilestream.kernels.near_cells import cells_around, neighbours_within
+from tilestream.kernels.neighbours import cells_around, neighbours_within
 from tilestream.kernels.nearest import group_by_cell
 from tilestream.kernels.pairs import (
     bhattacharyya_sums,

@@ -1,7 +1,7 @@
 """Representation quality: what the map's points lose as cells (the paper, section V.D)."""
 
 from tilestream.factors.vicinity import Sums, Terms, ratio
-from tilestream.kernels.near_cells import cells_around
+from tilestream.kernels.neighbours import cells_around
 from tilestream.kernels.nearest import REACH, group_by_cell, nearest_mean_sums
 from tilestream.records import Cells, Column, Float64, Int64
 

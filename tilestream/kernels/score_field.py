@@ -82,6 +82,8 @@ class Lanes(NamedTuple):
     """(2, SIDE, SIDE) the distance limit of each shift without that; row 0: none."""
     least: NDArray[np.int32]
     """(GROUP,) distance of the nearest cell so far, in whole steps."""
+    exponent: NDArray[np.float32]
+    """(GROUP,) exponent of that cell's value."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -191,13 +193,14 @@ def _sum_of_eight(A, U, slope, alive, pull, base, limited, i0, j0, total):  # ty
 
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False, fastmath={"contract"})
-def _sum_of_many(A, U, slope, alive, count, pull, base, limited, i0, j0, total, least):  # type: ignore[no-untyped-def]
+def _sum_of_many(A, U, slope, alive, count, pull, base, limited, i0, j0, total, least, exponent):  # type: ignore[no-untyped-def]
     """Add the values of a group where more cells are alive: first find each point's distance."""
     for s in range(BLOCK * BLOCK):
         i, j = i0 + s // BLOCK, j0 + s % BLOCK
         limit, i32, j32 = base[limited, i + 10, j + 10], np.int32(i), np.int32(j)
         for p in range(GROUP):
             least[p] = _limit(pull, limited, limit, p, i32, j32)
+            exponent[p] = CAP
         for n in range(count):
             k = alive[n]
             shift = _at_shift(slope, k, i, j)[0]
@@ -206,12 +209,14 @@ def _sum_of_many(A, U, slope, alive, count, pull, base, limited, i0, j0, total, 
         for n in range(count):
             k = alive[n]
             at_k = _at_shift(slope, k, i, j)
-            values = np.int32(0)
             for p in range(GROUP):
-                # Only the cell at the least distance itself is nearer than one step beyond it.
-                found = _nearer((np.int32(least[p] + 1), CAP), A, U, k, p, at_k)
-                values = np.int32(values + _value(min(found[1], CAP)))
-            total[i + 10, j + 10] += values
+                # Only the nearest cell itself is within one step beyond its distance.
+                found = np.int32(least[p] + 1), exponent[p]
+                exponent[p] = _nearer(found, A, U, k, p, at_k)[1]
+        values = np.int32(0)
+        for p in range(GROUP):
+            values = np.int32(values + _value(min(exponent[p], CAP)))
+        total[i + 10, j + 10] += values
 
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
@@ -391,7 +396,7 @@ def _add_group(near, cells, lanes, middle, half, limit, scale, total):  # type: 
     """Add the values of a group over all the shifts."""
     slack = (SET_BACK * cells + 8.0) / scale
     A, U, slope, alive = near.A, near.U, near.slope, near.alive
-    pull, base = lanes.pull, lanes.base
+    pull, base, least, exponent = lanes.pull, lanes.base, lanes.least, lanes.exponent
     r = 0.5 * (BLOCK - 1)
     hx, hy, hz = half[0] + r * STEP, half[1] + r * STEP, half[2]
     for i0 in range(-10, 11, BLOCK):
@@ -411,7 +416,7 @@ def _add_group(near, cells, lanes, middle, half, limit, scale, total):  # type: 
                 _sum_of_eight(A, U, slope, alive, pull, base, limited, i0, j0, total)
             else:
                 _sum_of_many(
-                    A, U, slope, alive, count, pull, base, limited, i0, j0, total, lanes.least
+                    A, U, slope, alive, count, pull, base, limited, i0, j0, total, least, exponent
                 )
 
 
@@ -475,6 +480,7 @@ def score_sums(
         np.zeros((2, 2 * GROUP), np.int32),
         np.full((2, SIDE, SIDE), ANY),
         np.empty(GROUP, np.int32),
+        np.empty(GROUP, np.float32),
     )
     total = np.empty((SIDE, SIDE), np.int64)
     for c in range(m):
