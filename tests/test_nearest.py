@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from tilestream.kernels.cells import cell_of_points, cell_sums, eigen, moments, regularise
-from tilestream.kernels.neighbours import cells_around
 from tilestream.kernels.nearest import REACH, group_by_cell, nearest_mean_sums
+from tilestream.kernels.neighbours import cells_around
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -17,8 +17,8 @@ from tilestream.factors.local_similarity import (
 )
 from tilestream.kernels import score_field
 from tilestream.kernels.density import magnusson_constants
-from tilestream.kernels.neighbours import cells_around
 from tilestream.kernels.nearest import group_by_cell
+from tilestream.kernels.neighbours import cells_around
 from tilestream.kernels.score_field import SHIFTS, SIDE, reach_of_shifts, score_sums
 
 Floats = NDArray[np.float64]

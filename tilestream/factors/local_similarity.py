@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from tilestream.factors.vicinity import Sums, Terms, ratio
 from tilestream.kernels.density import magnusson_constants
-from tilestream.kernels.neighbours import cells_around, neighbours_within
 from tilestream.kernels.nearest import group_by_cell
+from tilestream.kernels.neighbours import cells_around, neighbours_within
 from tilestream.kernels.pairs import (
     bhattacharyya_sums,
     entropy_of_counts,

@@ -1,8 +1,8 @@
 """Representation quality: what the map's points lose as cells (the paper, section V.D)."""
 
 from tilestream.factors.vicinity import Sums, Terms, ratio
-from tilestream.kernels.neighbours import cells_around
 from tilestream.kernels.nearest import REACH, group_by_cell, nearest_mean_sums
+from tilestream.kernels.neighbours import cells_around
 from tilestream.records import Cells, Column, Float64, Int64
 
 _NEAREST = "over the map points in the voxels of V(P); mu the nearest mean among all cells"
