@@ -28,6 +28,7 @@ KNOWN_ONLY_BY = {
     "distributed": {"dataflow"},
     "zarr": {"store"},
     "sklearn": {"forest"},
+    "skops": {"forest"},
     "numba": {"kernels"},
     "open3d": {"simulation", "formats"},
     "typer": {"cli"},

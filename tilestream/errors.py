@@ -57,6 +57,10 @@ class RegistrationError(TilestreamError, ValueError):
     """A scan that cannot be registered: nothing near it, too few points, start poses not rigid."""
 
 
+class ModelError(TilestreamError, ValueError):
+    """A model that cannot be trained, read or applied as asked; the message says why."""
+
+
 class TaskError(TilestreamError):
     """A task of the dataflow that failed; the message carries its reason."""
 

@@ -1,0 +1,97 @@
+"""Synthetic drives with the paper's error tails: factors and labels that vary smoothly."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from tilestream.forest.dataset import Dataset, join
+from tilestream.records import Column
+
+Floats = NDArray[np.float64]
+LENGTHS = {"I": 1163, "II": 734, "III": 269, "IV": 652, "V": 794}
+"""The paper's five paths [m], 3612 points in all (its Table III)."""
+CRITERIA = {
+    "FS": ["feature_count", *(f"D{d}_{k}" for k in ("count", "ratio") for d in (1, 2, 3))],
+    "RQ": ["euclidean_dist", "mahalanobis_dist"],
+    "LY": ["r_average", "normal_H_8", "normal_H_16", "normal_H_90", "angular_H", "FDOP"],
+    "LS": ["score_H", "pfh_sim_H", "pfh_sim_mnht", "bhatt_sim"],
+}
+CRITERIA["FS"].append("occupancy_ratio")
+COLUMNS = tuple(
+    Column(name, criterion, "1", name, "synthetic")  # type: ignore[arg-type]
+    for criterion, names in CRITERIA.items()
+    for name in names
+)
+WEAK_AXIS = Column("weak_axis", "LY", "rad", "An axis.", "synthetic", "robust")
+MEDIAN, SIGMA = 0.0884, 0.606
+"""A lognormal with the paper's tails: > 10 cm 41.9 %, > 25 cm 4.31 % (definitions, section 6)."""
+
+
+def smooth(rng: np.random.Generator, n: int, k: int, correlation: float = 20.0) -> Floats:
+    """(n, k) standard normal columns at a spacing of 1 m, correlated over `correlation` [m]."""
+    reach = int(3 * correlation)
+    kernel = np.exp(-((np.arange(-reach, reach + 1) / correlation) ** 2))
+    noise = rng.normal(size=(n + 2 * reach, k))
+    found = np.column_stack([np.convolve(noise[:, j], kernel, "valid") for j in range(k)])
+    return found / np.sqrt((kernel**2).sum())
+
+
+def drives(
+    seed: int = 0,
+    lengths: dict[str, int] | None = None,
+    related: float = 0.0,
+    columns: Sequence[Column] = COLUMNS,
+    noise: float = 0.0,
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Factors and labels of straight paths 1 km apart, at coordinates as large as UTM's.
+
+    Args:
+        seed: of the random numbers.
+        lengths: of the paths [m].
+        related: share of the label's variance (in logarithms) that three factors explain.
+        columns: the factors.
+        noise: standard deviation of a second drive's label, in logarithms.
+    """
+    rng = np.random.default_rng(seed)
+    factor_rows, label_rows = [], []
+    for k, (path, n) in enumerate((lengths or LENGTHS).items()):
+        z = smooth(rng, n, len(columns) + 1)
+        cause = (z[:, 0] - z[:, -2] + z[:, 9]) / np.sqrt(3.0)
+        shape = np.sqrt(related) * cause + np.sqrt(1.0 - related) * z[:, -1]
+        error = MEDIAN * np.exp(SIGMA * shape + noise * rng.normal(size=n))
+        place = {
+            "arc_length": np.arange(n, dtype=float),
+            "x": 370_000.0 + np.arange(n),
+            "y": np.full(n, 3_950_000.0 + 1000.0 * k),
+            "z": np.full(n, 42.0),
+            "heading": np.zeros(n),
+            "sample": np.arange(n),
+            "status": "done",
+            "reason": "",
+        }
+        values = {column.name: z[:, j] for j, column in enumerate(columns)}
+        factor_rows.append(pd.DataFrame({"route_id": path, **place, **values}))
+        label_rows.append(pd.DataFrame(place | labels_of(error)))
+    labels = pd.concat(label_rows, ignore_index=True)
+    return pd.concat(factor_rows, ignore_index=True), labels.assign(sample=np.arange(len(labels)))
+
+
+def labels_of(error: Floats) -> dict[str, Floats]:
+    """Labels that belong together, from the mean error."""
+    return {
+        "error_mean": error,
+        "p_fail": np.clip(error - 0.1, 0.0, 1.0),
+        "error_floor": 0.5 * error,
+        "error_tail": 0.5 * error,
+        "along_mean": 0.8 * error,
+        "across_mean": 0.5 * error,
+        "up_mean": 0.2 * error,
+    }
+
+
+def dataset(seed: int = 0, related: float = 0.7, lengths: dict[str, int] | None = None) -> Dataset:
+    """The same, joined."""
+    factors, labels = drives(seed, lengths, related)
+    return join(factors, {"drive": labels}, COLUMNS)

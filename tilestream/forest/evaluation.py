@@ -1,0 +1,242 @@
+"""How good estimates are: Table IV and what stands beside it, on every protocol."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+import pandas as pd
+from scipy.stats import spearmanr
+
+from tilestream.errors import ModelError
+from tilestream.forest.dataset import Dataset
+from tilestream.forest.models import COMPETITORS, PAPER, Recipe, grow
+from tilestream.forest.protocols import PROTOCOLS, Split, block_splits
+from tilestream.records import Column, Float64
+
+CRITERIA = ("FS", "RQ", "LY", "LS")
+"""The paper's four criteria, in the order in which Table IV adds them."""
+REPEATS = 5
+"""Permutations of a criterion."""
+PAPER_TABLE = pd.DataFrame(
+    {
+        "factors": ["FS", "FS+RQ", "FS+RQ+LY", "FS+RQ+LY+LS"],
+        "rmse": [0.0575, 0.0540, 0.0493, 0.0483],
+        "mae": [0.0339, 0.0314, 0.0292, 0.0283],
+        "within_25mm": [0.594, 0.601, 0.636, 0.641],
+        "within_50mm": [0.818, 0.839, 0.847, 0.857],
+    }
+)
+"""The paper's own Table IV [m, shares], its random split."""
+
+
+@dataclass(frozen=True)
+class Figures:
+    """How far estimates are from what was measured."""
+
+    points: int
+    """Points judged."""
+    rmse: float
+    """Root mean square error [unit of the target; m for lengths]."""
+    mae: float
+    """Mean absolute error [the same]."""
+    within_25mm: float
+    """Share of the points estimated with an error below 2.5 cm."""
+    within_50mm: float
+    """Share of the points estimated with an error below 5 cm."""
+    r2: float
+    """1 - squared error / squared deviation from the mean of the judged points; NaN if they are
+    all alike."""
+    skill: float
+    """1 - MAE / MAE of the training median; NaN if that is 0."""
+    spearman: float
+    """Rank correlation of estimate and label; NaN where one of them is constant."""
+
+
+def figures(actual: Float64, estimate: Float64, median: Float64) -> Figures:
+    """The figures of estimates.
+
+    Args:
+        actual: (n,) labels.
+        estimate: (n,) estimates of them.
+        median: (n,) the training median at each point, for the skill.
+
+    Raises:
+        ModelError: nothing to judge.
+    """
+    if not len(actual):
+        raise ModelError("no points to judge")
+    error = np.abs(estimate - actual)
+    spread = float(((actual - actual.mean()) ** 2).sum())
+    of_median = float(np.abs(median - actual).mean())
+    varied = np.ptp(actual) > 0.0 and np.ptp(estimate) > 0.0
+    return Figures(
+        points=len(actual),
+        rmse=float(np.sqrt((error**2).mean())),
+        mae=float(error.mean()),
+        within_25mm=float((error < 0.025).mean()),
+        within_50mm=float((error < 0.05).mean()),
+        r2=1.0 - float((error**2).sum()) / spread if spread > 0.0 else float("nan"),
+        skill=1.0 - float(error.mean()) / of_median if of_median > 0.0 else float("nan"),
+        spearman=float(spearmanr(actual, estimate).statistic) if varied else float("nan"),
+    )
+
+
+def held_out(
+    dataset: Dataset,
+    splits: Sequence[Split],
+    competitor: str,
+    target: str = "error_mean",
+    seed: int = 0,
+) -> pd.DataFrame:
+    """What a competitor estimates for points that it has not seen.
+
+    Returns:
+        A row per judged point: `row` of the dataset, `fold`, `group`, `path`, `block`,
+        `arc_length` [m], `actual`, `estimate`, `median` (of the training part).
+    """
+    parts = []
+    for split in splits:
+        train, judged = dataset.take(split.train), dataset.take(split.test)
+        part = judged.rows[["group", "path", "block", "arc_length"]].assign(
+            row=split.test,
+            fold=split.name,
+            actual=judged.label(target),
+            estimate=COMPETITORS[competitor](train, judged, target, seed),
+            median=float(np.median(train.label(target))),
+        )
+        parts.append(part)
+    return pd.concat(parts, ignore_index=True)
+
+
+def figures_of(points: pd.DataFrame) -> Figures:
+    """The figures of `held_out` points."""
+    names = ("actual", "estimate", "median")
+    return figures(*(points[name].to_numpy(np.float64) for name in names))
+
+
+def factor_sets(columns: Sequence[Column]) -> dict[str, tuple[Column, ...]]:
+    """The columns of Table IV: the criteria added one by one, then the robust twins where there."""
+    faithful = [c for c in columns if c.factor_set == "faithful"]
+    sets = {
+        "+".join(CRITERIA[: k + 1]): tuple(c for c in faithful if c.criterion in CRITERIA[: k + 1])
+        for k in range(len(CRITERIA))
+    }
+    if len(faithful) < len(columns):
+        sets["all + robust"] = tuple(columns)
+    return {name: chosen for name, chosen in sets.items() if chosen}
+
+
+def compare(
+    dataset: Dataset, competitors: Sequence[str], target: str = "error_mean", seed: int = 0
+) -> pd.DataFrame:
+    """Competitors side by side on every protocol, all on the same points.
+
+    Returns:
+        A row per protocol and competitor: `protocol`, `model`, the fields of `Figures`, `reason`
+        (why a protocol cannot be followed on this dataset; its figures are then NaN).
+
+    Raises:
+        ModelError: nothing can be learnt from the dataset.
+    """
+    dataset.check(target)
+    rows = []
+    for protocol in PROTOCOLS:
+        try:
+            splits = protocol.splits(dataset, seed)
+        except ModelError as error:
+            rows.append({"protocol": protocol.name, "reason": str(error)})
+            continue
+        for name in competitors:
+            found = figures_of(held_out(dataset, splits, name, target, seed))
+            rows.append({"protocol": protocol.name, "model": name, **asdict(found), "reason": ""})
+    return pd.DataFrame(rows)
+
+
+def table_iv(
+    dataset: Dataset, competitor: str = "paper", target: str = "error_mean", seed: int = 0
+) -> pd.DataFrame:
+    """The paper's Table IV on every protocol, and with the robust factors where there are any.
+
+    Returns:
+        As `compare`, with a column `factors`: the name of the factor set.
+    """
+    tables = [
+        compare(dataset.with_columns(columns), [competitor], target, seed).assign(factors=name)
+        for name, columns in factor_sets(dataset.columns).items()
+    ]
+    return pd.concat(tables, ignore_index=True)
+
+
+def ceiling(dataset: Dataset, target: str = "error_mean") -> Figures:
+    """What no model can pass: a repeated drive's label as the estimate of this drive's.
+
+    Every ordered pair of drives over one place counts once. The median is that of all labels.
+
+    Raises:
+        ModelError: no place was driven twice.
+    """
+    here = dataset.rows[["path", "arc_length", "group", target]]
+    pairs = here.merge(here, on=["path", "arc_length"], suffixes=("", "_again"))
+    pairs = pairs[pairs["group"] != pairs["group_again"]]
+    if pairs.empty:
+        raise ModelError("no place was driven twice: the ceiling needs a repeated drive")
+    median = np.full(len(pairs), np.median(dataset.label(target)))
+    return figures(pairs[target].to_numpy(), pairs[f"{target}_again"].to_numpy(), median)
+
+
+def importances(
+    dataset: Dataset, target: str = "error_mean", recipe: Recipe = PAPER, seed: int = 0
+) -> pd.DataFrame:
+    """The forest's own importances, as in Table IV: biased, since the counts are all correlated.
+
+    Returns:
+        A row per factor: `factor`, `criterion`, `importance` (they sum to 1).
+    """
+    forest = grow(dataset, target, recipe, seed)
+    return pd.DataFrame(
+        {
+            "factor": dataset.names,
+            "criterion": [column.criterion for column in dataset.columns],
+            "importance": forest.trees.feature_importances_,
+        }
+    )
+
+
+def criterion_importances(
+    dataset: Dataset, target: str = "error_mean", recipe: Recipe = PAPER, seed: int = 0
+) -> pd.DataFrame:
+    """How much worse held-out blocks are estimated when a criterion's factors are permuted.
+
+    All factors of a criterion move together, so what one of them knows cannot hide in another.
+
+    Returns:
+        A row per criterion: `criterion`, `factors` (how many), `increase` of the mean absolute
+        error [unit of the target], `spread` (its standard deviation over the repeats).
+    """
+    splits = block_splits(dataset)
+    criteria = list(dict.fromkeys(column.criterion for column in dataset.columns))
+    of = {c: [k for k, col in enumerate(dataset.columns) if col.criterion == c] for c in criteria}
+    rng = np.random.default_rng(seed)
+    increase = {criterion: np.zeros(REPEATS) for criterion in criteria}
+    for split in splits:
+        judged = dataset.take(split.test)
+        forest = grow(dataset.take(split.train), target, recipe, seed)
+        X, actual = judged.matrix(), judged.label(target)
+        plain = np.abs(forest.estimate(X) - actual).sum()
+        for criterion in criteria:
+            for repeat in range(REPEATS):
+                moved = X.copy()
+                moved[:, of[criterion]] = X[rng.permutation(len(X))][:, of[criterion]]
+                worse = np.abs(forest.estimate(moved) - actual).sum() - plain
+                increase[criterion][repeat] += worse / len(dataset)
+    return pd.DataFrame(
+        [
+            {
+                "criterion": criterion,
+                "factors": len(of[criterion]),
+                "increase": float(increase[criterion].mean()),
+                "spread": float(increase[criterion].std()),
+            }
+            for criterion in criteria
+        ]
+    )

@@ -1,0 +1,211 @@
+"""A model is one file: a skops archive of exactly these types, with all that it depends on inside.
+
+Reading one runs nothing from it: types are compared with a list before anything is built, and every
+tree is checked before it is walked, since scikit-learn walks trees without checking.
+"""
+
+import io
+import json
+import os
+import zipfile
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import sklearn
+import skops
+import skops.io
+from sklearn.ensemble import RandomForestRegressor
+
+from tilestream.errors import ModelError, SourceNotFoundError
+from tilestream.forest.domain import Domain
+from tilestream.forest.intervals import Interval
+from tilestream.forest.models import Forest
+from tilestream.forest.training import Model
+from tilestream.version import VERSION
+
+FORMAT = "tilestream model"
+FORMAT_VERSION = 1
+"""Raise it when a model of an older file would be read wrongly."""
+TRUSTED = ("sklearn.tree._tree.Tree",)
+"""What skops is told to build beyond what it trusts by itself."""
+TYPES = frozenset(
+    {
+        "builtins.dict",
+        "builtins.list",
+        "builtins.str",
+        "numpy.dtype",
+        "numpy.int64",
+        "numpy.ndarray",
+        "sklearn.ensemble._forest.RandomForestRegressor",
+        "sklearn.tree._classes.DecisionTreeRegressor",
+        *TRUSTED,
+    }
+)
+"""Every type that a model file may name."""
+
+
+def save_model(model: Model, path: str | os.PathLike[str]) -> None:
+    """Write a model in one piece: a file that is there is whole.
+
+    Args:
+        model: what to write.
+        path: a local path; a file there is replaced.
+    """
+    place = Path(path)
+    place.parent.mkdir(parents=True, exist_ok=True)
+    facts = {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "tilestream": VERSION,
+        "sklearn": sklearn.__version__,
+        "numpy": np.__version__,
+        "skops": skops.__version__,
+        "factors": list(model.factors),
+        "made_with": dict(model.made_with),
+        "data_set": dict(model.data_set),
+        "interval": {k: None if v != v else v for k, v in asdict(model.interval).items()},
+        "threshold": model.domain.threshold,
+        "worst": model.worst,
+        "log": {target: forest.log for target, forest in model.forests.items()},
+        "facts": dict(model.facts),
+    }
+    content = {
+        "facts": json.dumps(facts, sort_keys=True),
+        "forests": {target: forest.trees for target, forest in model.forests.items()},
+        "domain": {
+            "middle": model.domain.middle,
+            "scale": model.domain.scale,
+            "whitening": model.domain.whitening,
+        },
+    }
+    part = place.with_name(f"{place.name}.{os.getpid()}.part")
+    part.write_bytes(skops.io.dumps(content, compression=zipfile.ZIP_DEFLATED, compresslevel=6))
+    part.replace(place)
+
+
+def load_model(path: str | os.PathLike[str]) -> Model:
+    """Read a model; nothing in the file is executed.
+
+    Raises:
+        SourceNotFoundError: no file there.
+        ModelError: no model of tilestream, a damaged one, one that names other types (they are
+            listed), or one of another version of the format or of scikit-learn.
+    """
+    place = Path(path)
+    if not place.is_file():
+        raise SourceNotFoundError(f"{place}: no such model file")
+    data = place.read_bytes()
+    _refuse_other_types(place, data)
+    try:
+        content = skops.io.loads(data, trusted=list(TRUSTED))
+        facts = json.loads(content["facts"])
+        _refuse_other_versions(place, facts)
+        return _model(content, facts)
+    except ModelError:
+        raise
+    # A damaged archive fails anywhere inside skops and NumPy; all that it can mean is this.
+    except Exception as error:
+        raise ModelError(
+            f"{place}: a damaged model file ({type(error).__name__}: {error}): train it again"
+        ) from error
+
+
+def _refuse_other_types(place: Path, data: bytes) -> None:
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            schema = json.loads(archive.read("schema.json"))
+    except (zipfile.BadZipFile, KeyError, ValueError) as error:
+        raise ModelError(f"{place}: no model file of tilestream ({error})") from None
+    others = sorted(set(_types(schema)) - TYPES)
+    if others:
+        raise ModelError(
+            f"{place}: refused, since it names types that no model of tilestream has: "
+            f"{', '.join(others)}"
+        )
+
+
+def _types(node: Any) -> Iterator[str]:
+    """Every type that a skops schema names."""
+    if isinstance(node, dict):
+        if "__class__" in node or "__module__" in node:
+            yield f"{node.get('__module__')}.{node.get('__class__')}"
+        for value in node.values():
+            yield from _types(value)
+    elif isinstance(node, list):
+        for value in node:
+            yield from _types(value)
+
+
+def _refuse_other_versions(place: Path, facts: Mapping[str, Any]) -> None:
+    if facts.get("format") != FORMAT:
+        raise ModelError(f"{place}: no model of tilestream")
+    if facts["format_version"] != FORMAT_VERSION:
+        raise ModelError(
+            f"{place}: of format {facts['format_version']}, and this tilestream ({VERSION}) reads "
+            f"{FORMAT_VERSION}: train it again"
+        )
+    written, here = (v.split(".")[:2] for v in (facts["sklearn"], sklearn.__version__))
+    if written != here:
+        raise ModelError(
+            f"{place}: its trees are of scikit-learn {facts['sklearn']}, here is "
+            f"{sklearn.__version__}: train it again, or install that version"
+        )
+
+
+def _model(content: Mapping[str, Any], facts: Mapping[str, Any]) -> Model:
+    names = tuple(str(name) for name in facts["factors"])
+    forests = {
+        target: Forest(_checked(trees, len(names)), bool(facts["log"][target]))
+        for target, trees in content["forests"].items()
+    }
+    arrays = {name: np.asarray(a, np.float64) for name, a in content["domain"].items()}
+    shapes = {"middle": (len(names),), "scale": (len(names),), "whitening": (len(names),) * 2}
+    if {name: array.shape for name, array in arrays.items()} != shapes:
+        raise ModelError("a damaged model file: its domain has not its factors")
+    level, factor, blocks = (facts["interval"][k] for k in ("level", "factor", "blocks"))
+    return Model(
+        forests=forests,
+        domain=Domain(**arrays, threshold=float(facts["threshold"])),
+        interval=Interval(
+            float("nan") if level is None else float(level),
+            float("nan") if factor is None else float(factor),
+            int(blocks),
+        ),
+        factors=names,
+        made_with=facts["made_with"],
+        data_set=facts["data_set"],
+        worst=float(facts["worst"]),
+        facts=facts["facts"],
+    )
+
+
+def _checked(forest: Any, factors: int) -> RandomForestRegressor:
+    """The forest, if every path through its trees ends and asks for factors that are there.
+
+    Raises:
+        ModelError: a tree that would lead out of its own arrays.
+    """
+    if not isinstance(forest, RandomForestRegressor) or forest.n_features_in_ != factors:
+        raise ModelError("a damaged model file: its forest is not of its factors")
+    for estimator in forest.estimators_:
+        tree = estimator.tree_
+        nodes = np.arange(tree.node_count)
+        left, right = tree.children_left, tree.children_right
+        inner = left >= 0
+        ok = (
+            tree.n_features == factors
+            and tree.value.shape == (tree.node_count, 1, 1)
+            and bool(((left < 0) == (right < 0)).all())
+            # Children come after their parent, so every walk ends.
+            and bool((np.minimum(left, right) > nodes)[inner].all())
+            and bool((np.maximum(left, right) < tree.node_count)[inner].all())
+            and bool(((tree.feature >= 0) & (tree.feature < factors))[inner].all())
+            and bool(np.isfinite(tree.value).all())
+        )
+        if not ok:
+            raise ModelError("a damaged model file: a tree leads nowhere")
+    forest.set_params(n_jobs=1)
+    return forest

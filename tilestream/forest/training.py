@@ -1,0 +1,258 @@
+"""A model for every place: train it on a dataset, apply it to a table of factors."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from tilestream.errors import ModelError, UsageError
+from tilestream.forest.dataset import TARGETS, Dataset, with_derived
+from tilestream.forest.domain import Domain, domain_of
+from tilestream.forest.intervals import LEVEL, NOT_CALIBRATED, Interval, calibrate
+from tilestream.forest.models import PAPER, Forest, Recipe, grow, tuned
+from tilestream.forest.protocols import block_splits
+from tilestream.forest.reasons import contributions, in_words
+from tilestream.records import Column, Float64
+
+RECIPES = ("default", "paper")
+"""Ours, whose leaf is chosen on held-out blocks, and the paper's."""
+MAIN = "error_mean"
+ESTIMATES = {
+    "error_mean": "estimate",
+    "p_fail": "p_fail",
+    "error_floor": "floor",
+    "error_tail": "tail",
+    "along_mean": "along",
+    "across_mean": "across",
+    "up_mean": "up",
+}
+"""Name of each target's estimate."""
+WORST = 0.75
+"""Places whose estimate is above this quantile of the training labels are given a reason."""
+PREDICTION_COLUMNS = (
+    Column("estimate", "label", "m", "Estimated error_mean.", "definitions, section 6"),
+    Column("low", "label", "m", "Lower end of its interval.", "conformal by blocks"),
+    Column("high", "label", "m", "Upper end of its interval.", "conformal by blocks"),
+    Column("p_fail", "label", "1", "Estimated share of starts that fail.", "definitions, 5"),
+    Column("floor", "label", "m", "Estimated error_floor.", "definitions, section 5"),
+    Column("tail", "label", "m", "Estimated error_tail.", "definitions, section 5"),
+    Column("along", "label", "m", "Estimated mean of abs(along).", "definitions, section 5"),
+    Column("across", "label", "m", "Estimated mean of abs(across).", "definitions, section 5"),
+    Column("up", "label", "m", "Estimated mean of abs(up).", "definitions, section 5"),
+    Column(
+        "domain_distance",
+        "place",
+        "1",
+        "Distance from the training places; 1 is typical.",
+        "robust Mahalanobis distance",
+    ),
+    Column(
+        "in_domain",
+        "place",
+        "1",
+        "Whether the place is like the training places.",
+        "distance at most the 99 % quantile of held-out blocks",
+        dtype="bool",
+    ),
+    Column("status", "place", "", "done, or missing: no estimate.", "", dtype="str"),
+    Column(
+        "reason",
+        "place",
+        "",
+        "Why the estimate is high, the place strange, or there is no estimate; else empty.",
+        "contributions along the trees' paths",
+        dtype="str",
+    ),
+)
+"""What `predict` adds to a place."""
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """All that is needed to estimate the error of any place of a map."""
+
+    forests: Mapping[str, Forest]
+    """The forest of each target."""
+    domain: Domain
+    """The training places."""
+    interval: Interval
+    """The interval round `error_mean`."""
+    factors: tuple[str, ...]
+    """The features, in order."""
+    made_with: Mapping[str, Any]
+    """Sensor, cell size and units of the factors (`dataset.made_with`)."""
+    data_set: Mapping[str, Any]
+    """Identity of the labels: matcher, starts, true pose, cell size, sensor."""
+    worst: float
+    """Estimates above this are given a reason [m]."""
+    facts: Mapping[str, Any]
+    """How it was trained: recipe, seed, points, paths, targets left out and why."""
+
+
+def train(
+    dataset: Dataset, *, recipe: str = "default", seed: int = 0, n_jobs: int | None = 1
+) -> Model:
+    """Train a model on all points of a dataset, and calibrate it on held-out blocks.
+
+    Args:
+        dataset: labelled places.
+        recipe: `default` or `paper` (`RECIPES`).
+        seed: of the random numbers; the same seed and rows give the same model, to the bit.
+        n_jobs: while growing trees; None: what joblib's context says (Dask).
+
+    Raises:
+        ModelError: the dataset is too small, all alike, or mixed (`Dataset.check`).
+        UsageError: an unknown recipe.
+    """
+    if recipe not in RECIPES:
+        raise UsageError(f"no recipe {recipe!r}: choose from {', '.join(RECIPES)}")
+    dataset.check(MAIN)
+    grown = PAPER if recipe == "paper" else tuned(dataset, MAIN, seed, n_jobs)
+    # An axis or a tail that is the same everywhere teaches nothing and is learnt as that constant.
+    there = [target for target in TARGETS if target in dataset.rows]
+    forests = {target: grow(dataset, target, grown, seed, n_jobs) for target in there}
+    rows = dataset.rows
+    return Model(
+        forests=forests,
+        domain=domain_of(dataset.matrix(), rows["block"].to_numpy(str)),
+        interval=_interval(dataset, grown, seed, n_jobs),
+        factors=tuple(dataset.names),
+        made_with=dataset.made_with,
+        data_set=next(iter(dataset.data_sets.values()), {}),
+        worst=float(np.quantile(dataset.label(MAIN), WORST)),
+        facts={
+            "recipe": recipe,
+            "trees": grown.trees,
+            "leaf": grown.leaf,
+            "share": grown.share,
+            "log": grown.log,
+            "seed": seed,
+            "points": len(dataset),
+            "groups": sorted(set(rows["group"])),
+            "paths": sorted(set(rows["path"])),
+            "blocks": int(rows["block"].nunique()),
+            "lost": dataset.losses,
+        },
+    )
+
+
+def _interval(dataset: Dataset, recipe: Recipe, seed: int, n_jobs: int | None) -> Interval:
+    """The interval, from what forests say of blocks that they have not seen."""
+    try:
+        splits = block_splits(dataset)
+    except ModelError:
+        return NOT_CALIBRATED
+    estimate = np.empty(len(dataset))
+    for split in splits:
+        forest = grow(dataset.take(split.train), MAIN, recipe, seed, n_jobs)
+        estimate[split.test] = forest.estimate(dataset.take(split.test).matrix())
+    blocks = dataset.rows["block"].to_numpy(str)
+    return calibrate(dataset.label(MAIN), estimate, blocks, LEVEL)
+
+
+def predict(
+    model: Model, factors: pd.DataFrame, made_with: Mapping[str, Any] | None = None
+) -> pd.DataFrame:
+    """Estimate the error of places; each row for itself, the same bits in any company and order.
+
+    A row with a NaN among its factors has NaN estimates, status `missing` and a reason that names
+    the factor; nothing is imputed. Count them by `status`.
+
+    Args:
+        model: a trained or loaded model.
+        factors: a table with the model's factors; `heading` too where `weak_along` is one of them.
+        made_with: what these factors were computed with (`dataset.made_with`); compared with the
+            model's. None: the caller vouches for it.
+
+    Returns:
+        `PREDICTION_COLUMNS` on the index of `factors`; targets without labels are NaN.
+
+    Raises:
+        ModelError: a factor that the table lacks or that is no number, another sensor, cell size or
+            unit; says which.
+    """
+    if made_with is not None:
+        _same_making(model, made_with)
+    table = with_derived(factors)
+    X = _matrix(model, table)
+    good = np.asarray(np.isfinite(X).all(axis=1))
+    out = {c.name: np.full(len(X), np.nan) for c in PREDICTION_COLUMNS if c.dtype == "float64"}
+    if good.any():
+        for target, forest in model.forests.items():
+            out[ESTIMATES[target]][good] = forest.estimate(X[good])
+        out["low"], out["high"] = model.interval.around(out["estimate"])
+        out["domain_distance"][good] = model.domain.distance(X[good])
+    in_domain = np.logical_and(good, out["domain_distance"] <= model.domain.threshold)
+    columns: dict[str, Any] = {
+        **out,
+        "in_domain": in_domain,
+        "status": np.where(good, "done", "missing").astype(object),
+        "reason": _reasons(model, table, X, out["estimate"], good, in_domain),
+    }
+    return pd.DataFrame({c.name: columns[c.name] for c in PREDICTION_COLUMNS}, index=factors.index)
+
+
+def _matrix(model: Model, table: pd.DataFrame) -> Float64:
+    absent = [name for name in model.factors if name not in table]
+    if absent:
+        raise ModelError(f"the table lacks factors that the model needs: {', '.join(absent)}")
+    wrong = [name for name in model.factors if table[name].dtype.kind not in "iufb"]
+    if wrong:
+        raise ModelError(f"factors that are no numbers: {', '.join(wrong)}")
+    return np.ascontiguousarray(table[list(model.factors)].to_numpy(np.float64))
+
+
+def _same_making(model: Model, made_with: Mapping[str, Any]) -> None:
+    for name in sorted(set(model.made_with) | set(made_with)):
+        trained, given = model.made_with.get(name), made_with.get(name)
+        if name == "units" and isinstance(trained, Mapping) and isinstance(given, Mapping):
+            for factor in model.factors:
+                if trained.get(factor) != given.get(factor):
+                    raise ModelError(
+                        f"{factor} is in {given.get(factor)!r} in the table and was in "
+                        f"{trained.get(factor)!r} where the model was trained"
+                    )
+        elif trained != given:
+            raise ModelError(
+                f"{name} does not match: the model was trained with {_short(trained)}, the table "
+                f"was made with {_short(given)}: train a model for it"
+            )
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, Mapping) and "name" in value:
+        rest = ", ".join(f"{k} {v}" for k, v in value.items() if isinstance(v, int | float))
+        return f"{value['name']} ({rest})"
+    return repr(value)
+
+
+def _reasons(
+    model: Model,
+    table: pd.DataFrame,
+    X: Float64,
+    estimate: Float64,
+    good: NDArray[np.bool_],
+    in_domain: NDArray[np.bool_],
+) -> list[str]:
+    """For the worst places, the strange ones, and those without an estimate."""
+    words = np.full(len(X), "", dtype=object)
+    worst = np.flatnonzero(good & (estimate > model.worst))
+    if worst.size:
+        added = contributions(model.forests[MAIN].trees, X[worst])
+        words[worst] = in_words(added, X[worst], model.domain.middle, model.factors)
+    strange = np.flatnonzero(good & ~in_domain)
+    for row, k in zip(strange, model.domain.farthest(X[strange]), strict=True):
+        unlike = (
+            f"unlike the training places ({model.factors[k]} {X[row, k]:.3g}, typically "
+            f"{model.domain.middle[k]:.3g})"
+        )
+        words[row] = f"{words[row]}; {unlike}" if words[row] else unlike
+    given = table["reason"].fillna("").astype(str).to_numpy() if "reason" in table else None
+    for row in np.flatnonzero(~good):
+        bad = [name for name, x in zip(model.factors, X[row], strict=True) if not np.isfinite(x)]
+        why = f"no estimate: {bad[0]} is not a number"
+        words[row] = f"{why}: {given[row]}" if given is not None and given[row] else why
+    return [str(word) for word in words]
