@@ -109,7 +109,7 @@ def draw(store: ts.TileStore, found: dict[str, pd.DataFrame]) -> None:
     low = labels[["x", "y"]].min().to_numpy() - 28.0
     high = labels[["x", "y"]].max().to_numpy() + 28.0
     seen = ((points[:, :2] > low) & (points[:, :2] < high)).all(axis=1) & (points[:, 2] > -1.2)
-    figure, panels = plt.subplots(1, len(found), figsize=(11.0, 4.4), layout="constrained")
+    figure, panels = plt.subplots(1, len(found), figsize=(11.0, 5.2), layout="constrained")
     for axes, (title, table) in zip(panels, found.items(), strict=True):
         draw_panel(axes, points[seen][::2], table, title)
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="map x [m]")
@@ -129,7 +129,7 @@ def draw_panel(axes: Axes, points: np.ndarray, labels: pd.DataFrame, title: str)
         axes.annotate(
             f"scan {row.scan}: {100.0 * row.error_mean:.0f} cm",
             (row.x, row.y),
-            xytext=(14, -22 - 14 * place),
+            xytext=(-14 + 30 * place, -44 - 15 * place),
             textcoords="offset points",
             fontsize=8,
             arrowprops={"arrowstyle": "-", "lw": 0.5},

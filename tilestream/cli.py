@@ -5,6 +5,7 @@ Exit codes: 0 all good; 1 some sources, tiles or scans failed and are listed, th
 """
 
 import json
+import math
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -105,9 +106,11 @@ def parse_bytes(text: str) -> int:
         number = text.strip().upper().removesuffix(unit)
         if number != text.strip().upper():
             try:
-                return int(float(number) * factor)
-            except ValueError:
+                amount = int(float(number) * factor)
+            except (ValueError, OverflowError):
                 break
+            if amount > 0:
+                return amount
     raise UsageError(f"{text!r} is no amount of memory: give a form like 512MB or 2GB")
 
 
@@ -153,7 +156,7 @@ def tile_table(store: TileStore) -> Table:
     for key, mark in store.marks(POINTS).items():
         facts = mark.facts
         lowest, highest = (
-            " ".join(f"{value:.1f}" for value in facts.get(end, ()))
+            " ".join(f"{value:z.1f}" for value in facts.get(end, ()))
             for end in ("lowest", "highest")
         )
         points, read = (f"{facts[name]:,}" if name in facts else "" for name in ("points", "read"))
@@ -457,11 +460,11 @@ THRESHOLDS = (0.10, 0.15, 0.20, 0.25)
 """The paper's error thresholds [m] (its Table I)."""
 
 
-def error_facts(labels: pd.DataFrame) -> dict[str, float]:
-    """The errors of a drive in a few numbers: mean, median, tails [m], p_fail."""
+def error_facts(labels: pd.DataFrame) -> dict[str, float | None]:
+    """The errors of a drive in a few numbers: mean, median, tails [m], p_fail; None of nothing."""
     done = labels[labels["status"] == "done"]
     error = done["error_mean"]
-    return {
+    facts = {
         "sample_points": len(labels),
         "failed": len(labels) - len(done),
         "mean_m": float(error.mean()),
@@ -473,6 +476,7 @@ def error_facts(labels: pd.DataFrame) -> dict[str, float]:
         "tail_m": float(done["error_tail"].mean()),
         **{f"share_over_{t:.2f}_m": float((error > t).mean()) for t in THRESHOLDS},
     }
+    return {name: None if math.isnan(value) else value for name, value in facts.items()}
 
 
 def error_table(labels: pd.DataFrame) -> Table:
@@ -481,7 +485,7 @@ def error_table(labels: pd.DataFrame) -> Table:
     table.add_column("fact")
     table.add_column("value", justify="right")
     for name, value in error_facts(labels).items():
-        table.add_row(name, f"{value:.4g}" if isinstance(value, float) else f"{value:,}")
+        table.add_row(name, f"{value:.4g}" if isinstance(value, float) else str(value))
     for row in labels.nlargest(3, "error_mean").itertuples():
         place = f"worst: scan {row.scan} at {row.arc_length:.0f} m, ({row.x:.1f}, {row.y:.1f})"
         table.add_row(place, f"{row.error_mean:.4g} m")
@@ -505,7 +509,8 @@ def demo(
 
 def print_json(value: object) -> None:
     """One JSON document on stdout."""
-    sys.stdout.write(json.dumps(value, indent=2, sort_keys=True, default=str) + "\n")
+    text = json.dumps(value, indent=2, sort_keys=True, default=str, allow_nan=False)
+    sys.stdout.write(f"{text}\n")
 
 
 def main() -> None:

@@ -1,0 +1,483 @@
+"""The commands: what they print, what they exit with, one clear line for each error."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import logs
+import numpy as np
+import pytest
+import zarr
+from logs import START, pose
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from scenes import PLACES, in_map
+from scipy.spatial.transform import Rotation
+
+import tilestream as ts
+from tilestream.cli import parse_bytes, run
+from tilestream.errors import UsageError
+from tilestream.formats.las import write_las
+from tilestream.formats.mcap import open_log
+from tilestream.formats.pcd import write_pcd
+from tilestream.formats.ply import write_ply
+
+Told = pytest.CaptureFixture[str]
+
+
+@pytest.fixture(scope="module")
+def cloud() -> np.ndarray:
+    return in_map(PLACES["canyon"](np.random.default_rng(1), 40.0, 0.3))
+
+
+@pytest.fixture(scope="module")
+def pcd(cloud: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("pcd") / "street.pcd"
+    write_pcd(path, cloud)
+    return path
+
+
+@pytest.fixture(scope="module")
+def store(pcd: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    url = str(tmp_path_factory.mktemp("store") / "map.zarr")
+    ts.ingest(pcd, url, tile_size=20.0)
+    return url
+
+
+@pytest.fixture(scope="module")
+def log(cloud: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five scans along the street, and one of too few points."""
+    messages: list[logs.Message] = []
+    for i in range(6):
+        stamp, T = START + i * logs.SECOND, pose(x=10.0 + 3.0 * i, z=2.0)
+        seen = (cloud - T[:3, 3])[i::5]
+        seen = seen[np.linalg.norm(seen, axis=1) < 15.0]
+        messages.append(logs.odometry_at(stamp, T))
+        messages.append(logs.cloud_at(stamp, seen if i < 5 else seen[:4]))
+    path = tmp_path_factory.mktemp("log") / "drive.mcap"
+    return logs.write(path, messages, chunk_size=20_000)
+
+
+def fails(arguments: list[str], code: int, told: Told) -> str:
+    """The error line of a command that must end with this code, and without a traceback."""
+    told.readouterr()
+    assert run(arguments) == code
+    error = told.readouterr().err
+    assert "Traceback" not in error
+    (line,) = [line for line in error.splitlines() if line.startswith("error: ")]
+    return line
+
+
+def damaged(path: Path, target: Path, **change: Any) -> Path:
+    """A copy with its end cut off (`keep`, a share), or with a byte flipped (`flip`, an offset)."""
+    content = bytearray(path.read_bytes())
+    if "flip" in change:
+        content[change["flip"]] ^= 0x40
+    target.write_bytes(content[: int(len(content) * change.get("keep", 1.0))])
+    return target
+
+
+# --- The program
+
+
+def test_help_names_every_command(capsys: Told) -> None:
+    assert run(["--help"]) == 0
+    shown = capsys.readouterr().out
+    for command in ("ingest", "status", "info", "localize", "demo"):
+        assert command in shown
+        assert run([command, "--help"]) == 0
+        assert "Usage" in capsys.readouterr().out
+
+
+def test_version_is_that_of_the_package(capsys: Told) -> None:
+    assert run(["--version"]) == 0
+    assert capsys.readouterr().out.strip() == ts.__version__
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["nonsense"],
+        ["ingest"],
+        ["ingest", "a.pcd"],
+        ["ingest", "a.pcd", "--store", "m.zarr", "--tile-size", "wide"],
+        ["ingest", "a.pcd", "--store", "m.zarr", "--workers", "0"],
+        ["localize", "map.zarr", "drive.mcap"],
+        ["localize", "map.zarr", "drive.mcap", "--out", "run", "--matcher", "magic"],
+        ["status"],
+        ["info", "a.pcd", "--colour"],
+    ],
+)
+def test_a_line_that_is_no_command_exits_with_2(
+    arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Told
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(arguments) == 2
+    assert "Traceback" not in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_traceback_only_with_debug(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "tilestream", "status", str(tmp_path / "none.zarr")]
+    plain = subprocess.run(command, capture_output=True, text=True, check=False)
+    debug = subprocess.run([*command, "--debug"], capture_output=True, text=True, check=False)
+    assert plain.returncode == debug.returncode == 2
+    assert plain.stdout == ""
+    assert plain.stderr.startswith(f"error: no tile store at {tmp_path}/none.zarr: ")
+    assert plain.stderr.count("\n") == 1
+    assert "Traceback" in debug.stderr
+    assert plain.stderr in debug.stderr
+
+
+def test_amounts_of_memory() -> None:
+    assert parse_bytes("512MB") == 512_000_000
+    assert parse_bytes(" 1.5 gb ") == 1_500_000_000
+    for wrong in ("512", "MB", "many GB", "nan GB", "inf MB", "-1GB", "0MB"):
+        with pytest.raises(UsageError, match="memory"):
+            parse_bytes(wrong)
+
+
+# --- ingest
+
+
+def test_ingest_makes_a_map_and_prints_its_tiles(
+    pcd: Path, cloud: np.ndarray, tmp_path: Path, capsys: Told
+) -> None:
+    url = str(tmp_path / "map.zarr")
+    assert run(["ingest", str(pcd), "--store", url, "--tile-size", "20", "--map-leaf", "0"]) == 0
+    shown = capsys.readouterr().out
+    assert f"{pcd}: pcd binary, {len(cloud):,} points" in shown
+    store = ts.open_store(url)
+    assert sum(len(store.tile(key).points()) for key in store.keys()) == len(cloud)
+    for key in store.keys():
+        assert f" {key} " in shown
+        assert f" {len(store.tile(key).points()):,} " in shown
+    assert run(["ingest", str(pcd), "--store", url, "--tile-size", "20", "--map-leaf", "0"]) == 0
+
+
+def test_a_dry_run_prints_the_plan_and_writes_nothing(
+    pcd: Path, log: Path, store: str, tmp_path: Path, capsys: Told
+) -> None:
+    url, out = tmp_path / "map.zarr", tmp_path / "run"
+    assert run(["ingest", str(pcd), "--store", str(url), "--dry-run"]) == 0
+    assert "scatter" in capsys.readouterr().out
+    assert run(["localize", store, str(log), "--out", str(out), "--dry-run"]) == 0
+    shown = capsys.readouterr().out
+    assert all(stage in shown for stage in ("cells", "register", "label"))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_bad_source_among_good_ones_is_listed_and_the_rest_is_done(
+    pcd: Path, cloud: np.ndarray, tmp_path: Path, capsys: Told
+) -> None:
+    url = str(tmp_path / "map.zarr")
+    short = damaged(pcd, tmp_path / "short.pcd", keep=0.9)
+    wrong = tmp_path / "notes.pcd"
+    wrong.write_text("not a point cloud\n")
+    sources = [str(path) for path in (pcd, short, wrong)]
+    assert run(["ingest", *sources, "--store", url]) == 1
+    told = capsys.readouterr()
+    assert "Traceback" not in told.err
+    assert f"error: {url}: 2 sources or tiles failed, the rest is done:" in told.err
+    assert f"  {short}: {short}" in told.err
+    assert f"  {wrong}: {wrong}" in told.err
+    assert f"{pcd}: pcd binary, {len(cloud):,} points" in told.out
+    assert run(["status", url]) == 1
+    assert str(short) in capsys.readouterr().err
+
+
+def test_a_source_that_cannot_be_is_one_line(
+    pcd: Path, store: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Told
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    new = ["--store", "map.zarr"]
+    (tmp_path / "cloud.xyz").write_text("1 2 3\n")
+    (tmp_path / "empty").mkdir()
+    refused = {
+        "none.pcd": ["ingest", "none.pcd", *new],
+        "*.laz": ["ingest", "*.laz", *new],
+        "tile_size": ["ingest", str(pcd), *new, "--tile-size", "-1"],
+        "map_leaf": ["ingest", str(pcd), *new, "--map-leaf", "nan"],
+        "'much'": ["ingest", str(pcd), *new, "--memory", "much"],
+        "--memory": ["ingest", str(pcd), *new, "--memory", "1MB"],
+        "has tile_size 20.0, asked for is 50.0": [
+            *("ingest", str(pcd), "--store", store, "--tile-size", "50")
+        ],
+        "every = 2, offset = 2": ["ingest", str(pcd), *new, "--every", "2", "--offset", "2"],
+    }
+    for says, arguments in refused.items():
+        assert says in fails(arguments, 2, capsys), arguments
+    assert not (tmp_path / "map.zarr").exists() or not ts.open_store("map.zarr").keys()
+    assert run(["ingest", "cloud.xyz", "--store", "other.zarr"]) == 1
+    told = capsys.readouterr().err
+    assert "cloud.xyz" in told
+    assert "Traceback" not in told
+
+
+def test_two_crs_are_refused(cloud: np.ndarray, tmp_path: Path, capsys: Told) -> None:
+    paths = []
+    for name, crs in (("a.las", "EPSG:6677"), ("b.las", "EPSG:32654")):
+        write_las(tmp_path / name, cloud[:100], crs=crs)
+        paths.append(str(tmp_path / name))
+    line = fails(["ingest", *paths, "--store", str(tmp_path / "map.zarr")], 1, capsys)
+    assert all(path in line for path in paths)
+    assert not (tmp_path / "map.zarr").exists()
+
+
+def test_a_map_directory_that_points_outside_is_refused(
+    cloud: np.ndarray, tmp_path: Path, capsys: Told
+) -> None:
+    folder = tmp_path / "pointcloud_map"
+    folder.mkdir()
+    write_pcd(tmp_path / "secret.pcd", cloud[:100])
+    (folder / "pointcloud_map_metadata.yaml").write_text(
+        "x_resolution: 20.0\ny_resolution: 20.0\n../secret.pcd: [0, 0]\n"
+    )
+    assert run(["ingest", str(folder), "--store", str(tmp_path / "map.zarr")]) == 1
+    told = capsys.readouterr().err
+    assert "pointcloud_map_metadata.yaml" in told
+    assert "secret.pcd" in told
+    assert "Traceback" not in told
+
+
+# --- Logs as sources
+
+
+def test_a_log_becomes_a_map(log: Path, tmp_path: Path, capsys: Told) -> None:
+    url = str(tmp_path / "map.zarr")
+    assert run(["ingest", str(log), "--store", url, "--every", "2", "--offset", "1"]) == 0
+    shown = capsys.readouterr().out
+    assert "3 scans of /points" in shown
+    count = sum(len(scan.points) for scan in open_log(log).scans_at([1, 3, 5]))
+    assert f"mcap, {count:,} points" in shown
+
+
+def test_a_log_cut_short_is_recovered_and_the_loss_reported(
+    log: Path, tmp_path: Path, capsys: Told
+) -> None:
+    cut = damaged(log, tmp_path / "cut.mcap", keep=0.6)
+    assert run(["ingest", str(cut), "--store", str(tmp_path / "map.zarr")]) == 0
+    shown = capsys.readouterr().out
+    whole = len(open_log(cut))
+    assert 1 <= whole < 6
+    assert "cut short" in shown
+    assert f"{whole} whole scans recovered" in shown
+    assert run(["info", str(cut), "--json"]) == 0
+    notes = " ".join(json.loads(capsys.readouterr().out)["notes"])
+    assert f"{whole} whole scans recovered" in notes
+
+
+def test_a_flipped_byte_in_a_log_is_named_by_its_crc(
+    log: Path, store: str, tmp_path: Path, capsys: Told
+) -> None:
+    with log.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    chunk = summary.chunk_indexes[1]
+    bad = damaged(
+        log, tmp_path / "bad.mcap", flip=chunk.chunk_start_offset + chunk.chunk_length // 2
+    )
+    for arguments in (
+        ["info", str(bad)],
+        ["localize", store, str(bad), "--out", str(tmp_path / "run")],
+    ):
+        line = fails(arguments, 1, capsys)
+        assert "CRC" in line
+        assert str(bad) in line
+        assert str(chunk.chunk_start_offset) in line
+    assert run(["ingest", str(bad), "--store", str(tmp_path / "map.zarr")]) == 1
+    assert "CRC" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("lacking", ["poses", "clouds"])
+def test_a_log_without_poses_or_clouds_is_named(
+    lacking: str, store: str, tmp_path: Path, capsys: Told
+) -> None:
+    points = logs.street_points(np.random.default_rng(0))
+    made = (
+        logs.cloud_at(START, points) if lacking == "poses" else logs.odometry_at(START, np.eye(4))
+    )
+    log = logs.write(tmp_path / "half.mcap", [made])
+    line = fails(["localize", store, str(log), "--out", str(tmp_path / "run")], 1, capsys)
+    assert str(log) in line
+    assert {"poses": "pose", "clouds": "PointCloud2"}[lacking] in line
+    assert run(["ingest", str(log), "--store", str(tmp_path / "map.zarr")]) == 1
+    assert str(log) in capsys.readouterr().err
+
+
+# --- status and info
+
+
+def test_status_shows_the_tiles(store: str, capsys: Told) -> None:
+    assert run(["status", store]) == 0
+    shown = capsys.readouterr().out
+    for key, mark in ts.open_store(store).marks().items():
+        (line,) = [line for line in shown.splitlines() if line.split()[:1] == [str(key)]]
+        assert line.split()[1:3] == ["done", f"{mark.facts['points']:,}"]
+        corner = " ".join(f"{value:z.1f}" for value in mark.facts["highest"])
+        assert corner in line
+
+
+def test_status_for_machines(store: str, pcd: Path, capsys: Told) -> None:
+    assert run(["status", store, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    opened = ts.open_store(store)
+    assert told["settings"]["tile_size"] == 20.0
+    assert [source["path"] for source in told["sources"]] == [str(pcd)]
+    assert set(told["tiles"]) == {str(key) for key in opened.keys()}
+    for key in opened.keys():
+        tile = told["tiles"][str(key)]
+        points = opened.tile(key).points()
+        assert tile["status"] == "done"
+        assert tile["facts"]["points"] == len(points)
+        np.testing.assert_array_equal(tile["facts"]["lowest"], points.min(axis=0))
+
+
+def test_a_newer_store_is_refused(pcd: Path, tmp_path: Path, capsys: Told) -> None:
+    url = str(tmp_path / "map.zarr")
+    ts.ingest(pcd, url)
+    group = zarr.open_group(url, mode="r+")
+    ours = dict(group.attrs["tilestream"])
+    group.attrs["tilestream"] = ours | {"schema": ours["schema"] + 1}
+    for arguments in (["status", url], ["ingest", str(pcd), "--store", url]):
+        line = fails(arguments, 1, capsys)
+        assert url in line
+        assert "install the newer tilestream" in line
+
+
+@pytest.mark.parametrize("ending", ["pcd", "las", "laz", "ply", "mcap", "directory"])
+def test_info_tells_what_is_in_a_file(
+    ending: str, cloud: np.ndarray, log: Path, tmp_path: Path, capsys: Told
+) -> None:
+    path, count = tmp_path / f"street.{ending}", len(cloud)
+    if ending == "mcap":
+        path, count = log, sum(len(scan.points) for scan in open_log(log).scans())
+    elif ending == "directory":
+        path.mkdir()
+        write_pcd(path / "0.pcd", cloud)
+        (path / "pointcloud_map_metadata.yaml").write_text(
+            "x_resolution: 100.0\ny_resolution: 100.0\n0.pcd: [0, 0]\n"
+        )
+    else:
+        {"pcd": write_pcd, "ply": write_ply}.get(ending, write_las)(path, cloud)
+    assert run(["info", str(path)]) == 0
+    assert f"{count:,}" in capsys.readouterr().out
+    assert run(["info", str(path), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["points"] == count
+    assert told["format"].startswith("autoware" if ending == "directory" else ending)
+    if ending != "directory":
+        assert told["size_bytes"] == path.stat().st_size
+        assert {"x", "y", "z"} <= {name.lower() for name, _ in told["fields"]}
+    if told["bounds"] and ending != "mcap":
+        np.testing.assert_allclose(
+            told["bounds"], [cloud.min(axis=0), cloud.max(axis=0)], atol=1e-3
+        )
+
+
+def test_info_of_what_cannot_be_read(pcd: Path, tmp_path: Path, capsys: Told) -> None:
+    (tmp_path / "notes.txt").write_text("hello\n")
+    assert "notes.txt" in fails(["info", str(tmp_path / "notes.txt")], 1, capsys)
+    assert "none.pcd" in fails(["info", str(tmp_path / "none.pcd")], 2, capsys)
+    short = damaged(pcd, tmp_path / "short.pcd", keep=0.5)
+    assert str(short) in fails(["info", str(short)], 1, capsys)
+
+
+# --- localize and demo
+
+
+def test_localize_prints_the_errors(log: Path, store: str, tmp_path: Path, capsys: Told) -> None:
+    few = ["--radius", "0.4", "--out", str(tmp_path)]
+    assert run(["localize", store, str(log), *few, "--until-s", "5"]) == 0
+    shown = capsys.readouterr().out
+    assert "mean_m" in shown
+    assert "worst: scan" in shown
+    assert f"{tmp_path}/errors" in shown.replace("\n", "")
+    assert run(["localize", store, str(log), *few, "--json"]) == 1
+    told = capsys.readouterr()
+    assert "1 of 6 scans failed" in told.err
+    assert "scan 5: the scan has 4 points" in told.err
+    facts = json.loads(told.out)
+    labels = ts.localize(
+        ts.open_store(store), log, tmp_path / "again", starts=ts.StartSettings(radius=0.4)
+    )
+    assert (facts["sample_points"], facts["failed"]) == (6, 1)
+    assert facts["mean_m"] == pytest.approx(labels["error_mean"].mean())
+    assert facts["max_m"] == labels["error_mean"].max()
+    assert facts["share_over_0.10_m"] == (labels["error_mean"].dropna() > 0.1).mean()
+
+
+def test_the_json_of_a_drive_where_all_failed_is_json(
+    log: Path, store: str, tmp_path: Path, capsys: Told
+) -> None:
+    sparse = ["--max-range", "0.5", "--out", str(tmp_path / "run"), "--json"]
+    assert run(["localize", store, str(log), *sparse]) == 1
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is no JSON")
+
+    facts = json.loads(capsys.readouterr().out, parse_constant=refuse)
+    assert facts["failed"] == facts["sample_points"] == 6
+    assert facts["mean_m"] is None
+    assert run(["localize", store, str(log), *sparse[:-1]]) == 1
+    assert "6 of 6 scans failed" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        (["--spacing", "0"], "spacing"),
+        (["--max-range", "-1"], "range_max"),
+        (["--blind-rear", "400"], "blind_rear"),
+        (["--beams", "0"], "beams"),
+        (["--sweep", "0"], "sweep"),
+        (["--step", "0"], "step"),
+        (["--cell-size", "3"], "cell_size"),
+        (["--scan-leaf", "-1"], "scan_leaf"),
+        (["--offset", "3"], "offset"),
+        (["--starts-per-task", "0"], "starts_per_task"),
+    ],
+)
+def test_localize_refuses_what_cannot_be(
+    wrong: list[str], says: str, log: Path, store: str, tmp_path: Path, capsys: Told
+) -> None:
+    out = tmp_path / "run"
+    assert says in fails(["localize", store, str(log), "--out", str(out), *wrong], 2, capsys)
+    assert not out.exists()
+
+
+def test_the_demo_makes_a_map(tmp_path: Path, capsys: Told) -> None:
+    assert run(["demo", "--store", str(tmp_path / "map.zarr")]) == 0
+    assert "done" in capsys.readouterr().out
+    assert ts.open_store(str(tmp_path / "map.zarr")).keys()
+
+
+# --- Real data
+
+
+def test_the_real_drive_is_ingested_whole(shared_data: Path, tmp_path: Path) -> None:
+    drive = shared_data / "kitti_drive" / "drive.mcap"
+    clouds, poses = [], {}
+    with drive.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        for message in reader.iter_decoded_messages():
+            seen = message.decoded_message
+            stamp = (seen.header.stamp.sec, seen.header.stamp.nanosec)
+            if message.channel.topic == "/odometry":
+                p, q = seen.pose.pose.position, seen.pose.pose.orientation
+                R = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
+                poses[stamp] = R, np.array([p.x, p.y, p.z])
+            else:
+                rows = np.frombuffer(seen.data, "<f4").reshape(-1, seen.point_step // 4)
+                clouds.append((stamp, rows[:, :3].astype(np.float64)))
+    points = np.concatenate([xyz @ poses[stamp][0].T + poses[stamp][1] for stamp, xyz in clouds])
+    store = ts.ingest(drive, tmp_path / "map.zarr", map_leaf=0.0)
+    stored = np.concatenate([store.tile(key).points() for key in store.keys()])
+    assert len(clouds) == 52
+    assert store.sources()[0]["points"] == len(stored) == len(points)
+    np.testing.assert_allclose(stored.min(axis=0), points.min(axis=0), atol=0.6e-3)
+    np.testing.assert_allclose(stored.max(axis=0), points.max(axis=0), atol=0.6e-3)
+    np.testing.assert_allclose(stored.mean(axis=0), points.mean(axis=0), atol=1e-4)
