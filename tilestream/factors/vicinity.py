@@ -32,7 +32,7 @@ STANDING = "standing"
 """The term that says whether a cell's normal is not vertical: its azimuth is counted apart."""
 CELL_BLOCK = 16.0
 """Edge of the blocks of cells that are looked at together [m]; only speed depends on it."""
-POINT_BLOCK, POINT_GROUP = 3.0, 4
+POINT_BLOCK, POINT_GROUP = 2.5, 4
 """Edge of the blocks of points of the depth image [m], and of groups of them in blocks."""
 
 
@@ -159,11 +159,12 @@ class TileTerms:
 
     @cached_property
     def depth_blocks(self) -> tuple[Float64, Int64, Float64, Int64, Float64]:
-        """(3, d) points, starts and spheres of their blocks, starts and spheres of the groups."""
+        """(3, d) points, starts and (6, b) boxes of blocks, starts and boxes of groups of them."""
         points = self.depth_mm / MM_PER_M
         xyz, start, box = _blocks(points, POINT_BLOCK)
         _, group_start, group_box = _blocks(points, POINT_BLOCK * POINT_GROUP)
-        return xyz, start, _spheres(box), np.searchsorted(start, group_start), _spheres(group_box)
+        groups = np.searchsorted(start, group_start), np.ascontiguousarray(group_box.T)
+        return xyz, start, np.ascontiguousarray(box.T), *groups
 
     @cached_property
     def counted(self) -> NDArray[np.int16]:
@@ -198,13 +199,6 @@ def _blocks(points: Float64, edge: float) -> tuple[Float64, Int64, Float64]:
     xyz = np.ascontiguousarray(points.T)
     start, box = kernels.blocks_of(run, *xyz)
     return xyz, start, box
-
-
-def _spheres(box: Float64) -> Float64:
-    """(4, b) centres and radii [m] of spheres around boxes."""
-    centre, half = (box[:, :3] + box[:, 3:]) / 2.0, (box[:, 3:] - box[:, :3]) / 2.0
-    radius = np.sqrt((half**2).sum(axis=1)) + 1e-3
-    return np.ascontiguousarray(np.vstack([centre.T, radius]))
 
 
 def row_edges(sensor: Sensor) -> Float64:
@@ -254,8 +248,8 @@ def vicinity_sums(places: Float64, sensor: Sensor, tiles: Iterable[TileTerms]) -
     loose = np.zeros(k, np.int64)
     sines = _row_sines(sensor)
     guess = depth_image.row_guesses(sines)
-    words = -(-len(sensor.elevations_deg) // depth_image.WORD)
-    images = np.zeros((k, depth_image.COLUMNS, words), np.uint64)
+    pixels = depth_image.COLUMNS * len(sensor.elevations_deg)
+    images = np.zeros((k, pixels), np.bool_)
     for tile in tiles:
         if not names:
             names, whole, sums = tile.names, tile.whole, np.zeros((k, len(tile.names)), np.int64)
@@ -275,8 +269,8 @@ def vicinity_sums(places: Float64, sensor: Sensor, tiles: Iterable[TileTerms]) -
         **_histograms(counts),
         **_of_the_place(view, azimuth, reach),
         "score": field / FIELD_STEPS,
-        "occupied": depth_image.filled(images).astype(np.float64),
-        "pixels": np.full(k, float(depth_image.COLUMNS * len(sensor.elevations_deg))),
+        "occupied": images.sum(axis=1).astype(np.float64),
+        "pixels": np.full(k, float(pixels)),
         "loose_points": loose.astype(np.float64),
     }
 

@@ -1,7 +1,7 @@
 """Which pixels of a lidar's depth image the map fills (factor `occupancy_ratio`).
 
 Exact, though most points are never looked at: a block of points is passed over when the pixels that
-its bounding sphere can touch are all full already, and beyond some distance nearly all of them are.
+its box can touch are all full already, and beyond some distance nearly all of them are.
 """
 
 import numpy as np
@@ -12,8 +12,8 @@ from tilestream.kernels.azimuth import azimuth_bin_exactly, is_unsure, turns_gue
 
 COLUMNS = 360
 """Azimuth columns of the image, 1 deg each."""
-WORD = 64
-"""Rows that share a word of a column's bits."""
+MARGIN = 1e-6
+"""What rounding may do to the bounds of a box, generously [m, or sine]."""
 
 
 @njit(cache=True, nogil=True)
@@ -41,12 +41,31 @@ def thin(index: NDArray[np.int64], sums: NDArray[np.int64], edge_mm: int) -> NDA
     return out
 
 
-@njit(cache=True, nogil=True, boundscheck=False)
+@njit(cache=True, nogil=True)
+def row_guesses(edges: NDArray[np.float64]) -> NDArray[np.int32]:
+    """The row at the beginning of each of many even steps from the lowest to the highest edge.
+
+    The steps are so short (but no more than 2^16) that each holds at most one edge.
+    """
+    rows = len(edges) - 1
+    thinnest = np.min(np.diff(edges))
+    steps = np.int64(min(max(np.ceil((edges[-1] - edges[0]) / thinnest), 256.0) + 1.0, 65536.0))
+    guess = np.empty(steps, np.int32)
+    row = 0
+    for k in range(steps):
+        s = edges[0] + (edges[-1] - edges[0]) * (k - 1e-6) / steps
+        while row < rows - 1 and s >= edges[row + 1]:
+            row += 1
+        guess[k] = row
+    return guess
+
+
+@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
 def _row_of(s, edges, guess):  # type: ignore[no-untyped-def]
     """Row of the sine of an elevation; what lies beyond the outer edges is in the outer rows."""
     last = len(edges) - 2
     slot = np.int64((s - edges[0]) * (len(guess) / (edges[-1] - edges[0])))
-    row = guess[min(max(slot, 0), len(guess) - 1)]
+    row = np.int64(guess[min(max(slot, 0), len(guess) - 1)])
     while row < last and s >= edges[row + 1]:
         row += 1
     while row > 0 and s < edges[row]:
@@ -54,73 +73,69 @@ def _row_of(s, edges, guess):  # type: ignore[no-untyped-def]
     return row
 
 
-@njit(cache=True, nogil=True)
-def row_guesses(edges: NDArray[np.float64]) -> NDArray[np.int64]:
-    """A row near each of 1024 even steps from the lowest to the highest edge."""
-    steps = 1024
-    guess = np.empty(steps, np.int64)
-    row = 0
-    for k in range(steps):
-        s = edges[0] + (edges[-1] - edges[0]) * k / steps
-        while row < len(edges) - 2 and s >= edges[row + 1]:
-            row += 1
-        guess[k] = row
-    return guess
-
-
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-def _in_view(spheres, first, last, place, reach, edges, out):  # type: ignore[no-untyped-def]
-    """Spheres first to last that reach into the range and between the outer edges; their number."""
+def _in_view(box, first, last, place, reach, edges, out):  # type: ignore[no-untyped-def]
+    """Boxes first to last that reach into the range and between the outer edges; their number."""
     px, py, pz = place[0], place[1], place[2]
-    low, high = edges[0], edges[-1]
-    low_cos, high_cos = np.sqrt(1.0 - low * low), np.sqrt(1.0 - high * high)
+    low = edges[0] / np.sqrt(1.0 - edges[0] * edges[0])
+    high = edges[-1] / np.sqrt(1.0 - edges[-1] * edges[-1])
     found = 0
     for i in range(first, last):
-        x, y, z = spheres[0, i] - px, spheres[1, i] - py, spheres[2, i] - pz
-        radius = spheres[3, i]
-        flat = np.sqrt(x * x + y * y)
-        far = x * x + y * y + z * z > (reach + radius) * (reach + radius)
-        above = z * high_cos - flat * high > radius
-        below = flat * low - z * low_cos > radius
+        x0, y0, z0 = box[0, i] - px, box[1, i] - py, box[2, i] - pz
+        x1, y1, z1 = box[3, i] - px, box[4, i] - py, box[5, i] - pz
+        x_near, y_near = max(x0, -x1, 0.0), max(y0, -y1, 0.0)
+        x_far, y_far = max(-x0, x1), max(-y0, y1)
+        z_near = max(z0, -z1, 0.0)
+        near = x_near * x_near + y_near * y_near
+        beyond = near + z_near * z_near > reach * reach + MARGIN
+        near, far = np.sqrt(near), np.sqrt(x_far * x_far + y_far * y_far)
+        above = z0 > high * (far if high > 0.0 else near) + MARGIN
+        below = z1 < low * (far if low < 0.0 else near) - MARGIN
         out[found] = i
-        found += not (far | above | below)
+        found += not (beyond | above | below)
     return found
 
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-def _is_full(spheres, i, place, edges, guess, image):  # type: ignore[no-untyped-def]
-    """Whether no point of sphere i, which is in view, can fill a pixel that is still empty."""
-    x, y, z = spheres[0, i] - place[0], spheres[1, i] - place[1], spheres[2, i] - place[2]
-    radius = spheres[3, i]
-    flat_squared = x * x + y * y
-    if radius * radius > 0.5 * flat_squared:
+def _is_full(box, i, place, edges, guess, image):  # type: ignore[no-untyped-def]
+    """Whether no point of box i, which is in view, can fill a pixel that is still empty."""
+    x0, y0, z0 = box[0, i] - place[0], box[1, i] - place[1], box[2, i] - place[2]
+    x1, y1, z1 = box[3, i] - place[0], box[4, i] - place[1], box[5, i] - place[2]
+    x_near, y_near = max(x0, -x1, 0.0), max(y0, -y1, 0.0)
+    x_far, y_far = max(-x0, x1), max(-y0, y1)
+    near, far = x_near * x_near + y_near * y_near, x_far * x_far + y_far * y_far
+    if near < 0.1:
         return False
-    flat, inverse = np.sqrt(flat_squared), 1.0 / np.sqrt(flat_squared + z * z)
-    # The sphere is seen within asin(radius / distance) of its centre's elevation, and within
-    # asin(radius / flat) <= 1.5 radius / flat of its azimuth; the margins are for rounding.
-    sine = radius * inverse
-    cosine = np.sqrt(1.0 - sine * sine)
-    row_lo = _row_of((z * cosine - flat * sine) * inverse - 1e-6, edges, guess)
-    row_hi = _row_of((z * cosine + flat * sine) * inverse + 1e-6, edges, guess)
+    lowest = z0 / np.sqrt((near if z0 < 0.0 else far) + z0 * z0)
+    highest = z1 / np.sqrt((near if z1 > 0.0 else far) + z1 * z1)
+    x, y = 0.5 * (x0 + x1), 0.5 * (y0 + y1)
+    left, right = 0.0, 0.0
+    for corner_x, corner_y in ((x0, y0), (x0, y1), (x1, y0), (x1, y1)):
+        slope = (x * corner_y - y * corner_x) / (x * corner_x + y * corner_y)
+        if not abs(slope) < 1.0:
+            return False
+        left, right = min(left, slope), max(right, slope)
+    # |slope| < 1 puts a corner within 45 deg of the middle, and an angle is less than its tangent.
     middle = turns_guess(x, y) * COLUMNS
-    spread = radius / flat * (1.5 * COLUMNS / (2.0 * np.pi)) + 1e-2
-    column_lo, column_hi = np.int64(np.floor(middle - spread)), np.int64(np.floor(middle + spread))
-    for word in range(image.shape[1]):
-        first, last = max(row_lo - word * WORD, 0), min(row_hi - word * WORD, WORD - 1)
-        if first > last:
-            continue
-        ones = np.uint64(0xFFFFFFFFFFFFFFFF)
-        need = (ones >> np.uint64(WORD - 1 - last)) & (ones << np.uint64(first))
+    per_radian = COLUMNS / (2.0 * np.pi)
+    column_lo = np.int64(np.floor(middle + left * per_radian - 1e-2))
+    column_hi = np.int64(np.floor(middle + right * per_radian + 1e-2))
+    row_lo = _row_of(lowest - MARGIN, edges, guess)
+    row_hi = _row_of(highest + MARGIN, edges, guess)
+    for row in range(row_lo, row_hi + 1):
         for c in range(column_lo, column_hi + 1):
             column = c + COLUMNS if c < 0 else (c - COLUMNS if c >= COLUMNS else c)
-            if image[column, word] & need != need:
+            if not image[row * COLUMNS + column]:
                 return False
     return True
 
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-def _fill(x, y, z, place, reach, edges, guess, image, sines, turns, fresh, found):  # type: ignore[no-untyped-def]
-    """Fill the pixels of some points; those that filled an empty one are added to `fresh`."""
+def _directions(x, y, z, place, reach, sines, turns):  # type: ignore[no-untyped-def]
+    """Sines of the elevations and turns of the azimuths of points; out of range: a sine of 2.
+
+    A loop of its own, without a branch or a table, for the compiler to vectorise.
+    """
     px, py, pz = place[0], place[1], place[2]
     for i in range(len(x)):
         dx, dy, dz = x[i] - px, y[i] - py, z[i] - pz
@@ -128,16 +143,26 @@ def _fill(x, y, z, place, reach, edges, guess, image, sines, turns, fresh, found
         r = np.sqrt(rr)
         sines[i] = dz / r if (rr > 0.0) & (r <= reach) else 2.0
         turns[i] = turns_guess(dx, dy)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+def _fill(x, y, z, place, reach, edges, guess, image, sines, turns, fresh, found):  # type: ignore[no-untyped-def]
+    """Fill the pixels of some points; those that filled an empty one are added to `fresh`."""
+    _directions(x, y, z, place, reach, sines, turns)
+    low, high, last = edges[0], edges[-1], np.int64(len(edges) - 2)
+    scale, steps = len(guess) / (high - low), np.int64(len(guess) - 1)
     for i in range(len(x)):
-        if not edges[0] <= sines[i] <= edges[-1]:
+        s = sines[i]
+        if not low <= s <= high:
             continue
+        row = np.int64(guess[np.uint64(min(np.int64((s - low) * scale), steps))])
+        row += (s >= edges[np.uint64(row + 1)]) & (row < last)
         column = np.int64(turns[i] * COLUMNS)
         if is_unsure(turns[i], COLUMNS):
-            column = azimuth_bin_exactly(x[i] - px, y[i] - py, COLUMNS)
-        row = _row_of(sines[i], edges, guess)
-        bit = np.uint64(1) << np.uint64(row % WORD)
-        if not image[column, row // WORD] & bit:
-            image[column, row // WORD] |= bit
+            column = azimuth_bin_exactly(x[i] - place[0], y[i] - place[1], COLUMNS)
+        pixel = np.uint64(row * COLUMNS + column)
+        if not image[pixel]:
+            image[pixel] = True
             fresh[0, found], fresh[1, found], fresh[2, found] = x[i], y[i], z[i]
             found += 1
     return found
@@ -148,13 +173,13 @@ def add_points(
     places: NDArray[np.float64],
     reach: float,
     edges: NDArray[np.float64],
-    guess: NDArray[np.int64],
+    guess: NDArray[np.int32],
     xyz: NDArray[np.float64],
     start: NDArray[np.int64],
-    spheres: NDArray[np.float64],
+    box: NDArray[np.float64],
     group_start: NDArray[np.int64],
-    group_spheres: NDArray[np.float64],
-    images: NDArray[np.uint64],
+    group_box: NDArray[np.float64],
+    images: NDArray[np.bool_],
 ) -> None:
     """Fill the pixels of the depth images of k sample points that hold a point of one tile.
 
@@ -166,16 +191,16 @@ def add_points(
         places: (k, 3) sample points [m, map frame], best in the order of a route.
         reach: range of the sensor [m].
         edges: (rows + 1,) sines of the elevations of the rows' edges, rising.
-        guess: (1024,) `row_guesses` of these edges.
+        guess: `row_guesses` of these edges.
         xyz: (3, n) points [m, map frame], block by block.
         start: (b + 1,) starts of the blocks.
-        spheres: (4, b) spheres around the blocks: centre and radius [m].
+        box: (6, b) lowest x, y, z and highest x, y, z of the blocks [m].
         group_start: (g + 1,) starts of groups of blocks.
-        group_spheres: (4, g) spheres around the groups.
-        images: (k, COLUMNS, words) bits of the rows per column; receives the pixels.
+        group_box: (6, g) those of the groups.
+        images: (k, rows * COLUMNS) pixels, row by row; receives True for those that are filled.
     """
-    blocks, groups = spheres.shape[1], group_spheres.shape[1]
-    pixels = (len(edges) - 1) * COLUMNS
+    blocks, groups = box.shape[1], group_box.shape[1]
+    pixels = images.shape[1]
     largest = max(pixels, np.max(np.diff(start)) if blocks else 0)
     sines, turns = np.empty(largest), np.empty(largest)
     near_groups, near_blocks = np.empty(groups + 1, np.int64), np.empty(blocks + 1, np.int64)
@@ -185,31 +210,17 @@ def add_points(
         fresh, before = before, fresh
         x, y, z = before[0, :found], before[1, :found], before[2, :found]
         found = _fill(x, y, z, place, reach, edges, guess, image, sines, turns, fresh, 0)
-        for g in near_groups[
-            : _in_view(group_spheres, 0, groups, place, reach, edges, near_groups)
-        ]:
-            if _is_full(group_spheres, g, place, edges, guess, image):
+        n_groups = _in_view(group_box, 0, groups, place, reach, edges, near_groups)
+        for g in near_groups[:n_groups]:
+            if _is_full(group_box, g, place, edges, guess, image):
                 continue
             first, last = group_start[g], group_start[g + 1]
-            for b in near_blocks[
-                : _in_view(spheres, first, last, place, reach, edges, near_blocks)
-            ]:
-                if _is_full(spheres, b, place, edges, guess, image):
+            n_blocks = _in_view(box, first, last, place, reach, edges, near_blocks)
+            for b in near_blocks[:n_blocks]:
+                if _is_full(box, b, place, edges, guess, image):
                     continue
                 i, j = start[b], start[b + 1]
                 x, y, z = xyz[0, i:j], xyz[1, i:j], xyz[2, i:j]
                 found = _fill(
                     x, y, z, place, reach, edges, guess, image, sines, turns, fresh, found
                 )
-
-
-@njit(cache=True, nogil=True)
-def filled(images: NDArray[np.uint64]) -> NDArray[np.int64]:
-    """Number of pixels set in each of (k, COLUMNS, words) images."""
-    out = np.zeros(len(images), np.int64)
-    for p in range(len(images)):
-        for bits in images[p].flat:
-            while bits:
-                bits &= bits - np.uint64(1)
-                out[p] += 1
-    return out
