@@ -27,8 +27,8 @@ LARGEST_SCAN = 10_000.0
 """Largest distance of a scan point from the lidar [m]; a farther one is in another frame."""
 RIGID = 1e-4
 """How far R^T R of a start may be from the identity: poses are often written with 6 digits."""
-MAX_ANCHORS = 2**28
-"""Largest dense grid around a scan."""
+MAX_ANCHORS = 2**27
+"""Largest dense grid around a scan: half a gigabyte of lists' beginnings."""
 FAILED = 0.5
 """3D error beyond which a start has failed [m]."""
 NEAR = 1.0
