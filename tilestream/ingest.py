@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tilestream.errors import CorruptSourceError, UsageError
+from tilestream.errors import CorruptSourceError
 from tilestream.formats import open_source
 from tilestream.formats.base import Span
 from tilestream.kernels import scatter as scatter_kernels
@@ -25,13 +25,14 @@ from tilestream.tiling import MAX_XY_MM, MAX_Z_MM, MM_PER_M, TileGrid, TileKey, 
 
 Int32 = NDArray[np.int32]
 
-MERGE_VERSION = 1
+MERGE_VERSION = 2
 """Raise it when the points that a merge writes change: tiles made by another one are redone."""
 BYTES_PER_BLOCK_POINT = 160
 """Memory of a scatter task per point of its block: as read, float64, int64, grouped int32."""
-BYTES_PER_TILE_POINT = 320
-"""Memory of a merge task per voxel (or, unthinned, per point): a hash table that has just doubled,
-the sorted slots, the centroids."""
+BYTES_PER_TILE_POINT = 64
+"""Memory of a merge task per point: read, ordered, keys and counts of an axis, the result."""
+MAX_BINS = 2**22
+"""Widest range of voxels along an axis that is counted as it is."""
 SORT_EDGE_MM = 1000
 """Unthinned points are stored sorted by voxels of this edge, then by x, y, z."""
 MAX_WINDOW = 50_000_000
@@ -225,7 +226,7 @@ def merge(
     Returns:
         The mark as written, with the count and extents of the points.
     """
-    tile = Tile(store, key)
+    tile, origin = Tile(store, key), np.array(store.grid.origin_mm(key), np.int64)
     known = tile.mark(POINTS)
     if known.same_work(mark):
         return known
@@ -235,13 +236,14 @@ def merge(
     borders = [edge * (columns * i // strips) for i in range(strips + 1)]
     parts = []
     for lo, hi in itertools.pairwise(borders):
-        batches = (
+        batches = [
             b[(b[:, 0] >= lo) & (b[:, 0] < hi)] if strips > 1 else b
             for b in read_pieces(store, pieces, batch)
-        )
-        parts.append(thin(batches, leaf, columns) if leaf else sort(batches))
+        ]
+        points = np.concatenate(batches)
+        del batches
+        parts.append(thin(points, leaf, origin) if leaf else sort(points))
     xyz = np.concatenate(parts, axis=1) if len(parts) > 1 else parts[0]
-    origin = np.array(store.grid.origin_mm(key))
     facts = {
         "points": xyz.shape[1],
         "read": sum(piece.count for piece in pieces),
@@ -270,42 +272,35 @@ def read_pieces(store: TileStore, pieces: Iterable[Piece], batch: int) -> Iterat
             yield np.frombuffer(data, np.int32).reshape(-1, 3)
 
 
-def thin(batches: Iterable[Int32], leaf: int, columns: int) -> Int32:
+def thin(points: Int32, leaf: int, origin: Int64) -> Int32:
     """One point per voxel: (3, m) int32 centroids [mm from the tile's origin], in voxel order."""
-    z_lo = -MAX_Z_MM // leaf
-    heights = 2 * MAX_Z_MM // leaf + 2
-    if columns * columns * heights >= 2**62:
-        raise UsageError(
-            f"map_leaf {leaf / MM_PER_M:g} m is too fine for tiles of "
-            f"{columns * leaf / MM_PER_M:g} m: use smaller tiles or a coarser leaf"
-        )
-    keys = np.full(1 << 14, thinning.EMPTY)
-    sums = np.zeros((len(keys), 4), np.int64)
-    taken = 0
-    for batch in batches:
-        for start in range(0, len(batch), max(1, len(keys) // 4)):
-            part = batch[start : start + max(1, len(keys) // 4)]
-            taken += thinning.add_to_voxels(part, leaf, z_lo, columns, heights, keys, sums)
-            if taken > len(keys) // 4:
-                keys, sums = larger(keys, sums)
-    slots = np.flatnonzero(keys != thinning.EMPTY)
-    order = slots[np.argsort(keys[slots])]
-    out = np.empty((3, len(order)), np.int32)
-    thinning.centroids(order, keys, sums, leaf, z_lo, columns, heights, out)
-    return out
+    ordered = by_voxel(points, leaf)
+    out = np.empty_like(ordered)
+    voxels = thinning.centroids(ordered, leaf, origin, out)
+    return np.ascontiguousarray(out[:voxels].T)
 
 
-def larger(keys: Int64, sums: Int64) -> tuple[Int64, Int64]:
-    """The same hash table with twice the slots."""
-    new_keys = np.full(2 * len(keys), thinning.EMPTY)
-    new_sums = np.zeros((2 * len(keys), 4), np.int64)
-    thinning.rehash(keys, sums, new_keys, new_sums)
-    return new_keys, new_sums
-
-
-def sort(batches: Iterable[Int32]) -> Int32:
+def sort(points: Int32) -> Int32:
     """All points, (3, n) int32, by voxels of SORT_EDGE_MM, then x, y, z."""
-    points = np.concatenate([np.empty((0, 3), np.int32), *batches])
-    x, y, z = points.T
-    order = np.lexsort((z, y, x, z // SORT_EDGE_MM, y // SORT_EDGE_MM, x // SORT_EDGE_MM))
-    return np.ascontiguousarray(points[order].T)
+    ordered = by_voxel(points, SORT_EDGE_MM)
+    thinning.sort_in_voxels(ordered, SORT_EDGE_MM)
+    return np.ascontiguousarray(ordered.T)
+
+
+def by_voxel(points: Int32, edge: int) -> Int32:
+    """The (n, 3) points ordered by voxel, lexicographically: a counting sort per axis, z first."""
+    for axis in (2, 1, 0):
+        keys = dense(points[:, axis] // np.int32(edge))
+        counts = np.bincount(keys)
+        ordered = np.empty_like(points)
+        thinning.place_rows(points, keys, np.cumsum(counts) - counts, ordered)
+        points = ordered
+    return points
+
+
+def dense(keys: Int32) -> Int64:
+    """The keys from 0, in their order; without gaps where stray points make these too wide."""
+    lowest = int(keys.min(initial=0))
+    if int(keys.max(initial=0)) - lowest > MAX_BINS:
+        return np.unique(keys, return_inverse=True)[1].astype(np.int64)
+    return keys.astype(np.int64) - lowest

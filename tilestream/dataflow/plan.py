@@ -6,7 +6,7 @@ from typing import Protocol
 
 from tilestream.errors import PlanError
 
-BASE_BYTES = 300_000_000
+BASE_BYTES = 350_000_000
 """Memory of a worker process before its first task: Python, NumPy, Numba, Zarr, Dask (measured
 by benchmarks/ingest.py)."""
 DEFAULT_MEMORY = 1_000_000_000

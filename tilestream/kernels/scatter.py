@@ -64,10 +64,13 @@ def tile_of_points(points_mm, tile_mm, ix_lo, iy_lo, rows, tile_of, counts):  # 
         tile_of: (n,) int32, receives the number of the tile: (ix - ix_lo) * rows + iy - iy_lo.
         counts: (tiles of the window,) int64, the points of each tile are added.
     """
+    # the floor of a float64 quotient of whole numbers is exact below 2^52, and far faster
     for i in range(points_mm.shape[0]):
-        tile = (points_mm[i, 0] // tile_mm - ix_lo) * rows + points_mm[i, 1] // tile_mm - iy_lo
-        tile_of[i] = tile
-        counts[tile] += 1
+        ix = np.int64(np.floor(points_mm[i, 0] / tile_mm))
+        iy = np.int64(np.floor(points_mm[i, 1] / tile_mm))
+        tile_of[i] = (ix - ix_lo) * rows + iy - iy_lo
+    for i in range(points_mm.shape[0]):
+        counts[tile_of[i]] += 1
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -88,12 +91,16 @@ def group_by_tile(points_mm, tile_of, tile_mm, ix_lo, iy_lo, rows, next_row, out
         out: (n, 3) int32, receives the millimetres from the tile's origin.
         prints: (tiles, 2) uint64, the fingerprints are added.
     """
+    last, x_lo, y_lo = -1, 0, 0
     for i in range(points_mm.shape[0]):
         tile = tile_of[i]
+        if tile != last:
+            last = tile
+            x_lo, y_lo = (ix_lo + tile // rows) * tile_mm, (iy_lo + tile % rows) * tile_mm
         row = next_row[tile]
         next_row[tile] = row + 1
-        x = points_mm[i, 0] - (ix_lo + tile // rows) * tile_mm
-        y = points_mm[i, 1] - (iy_lo + tile % rows) * tile_mm
+        x = points_mm[i, 0] - x_lo
+        y = points_mm[i, 1] - y_lo
         z = points_mm[i, 2]
         out[row, 0] = x
         out[row, 1] = y
