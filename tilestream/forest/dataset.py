@@ -218,9 +218,7 @@ def join(
     if not features:
         raise UsageError("the factor table has none of the catalogue's factors")
     joined = [_joined(places, name, labels[name], tolerance) for name in sorted(labels)]
-    table = pd.concat(
-        [frame for frame in joined if len(frame)] or [places.iloc[:0].assign(reason="")]
-    )
+    table = pd.concat(joined or [_joined(places, "", _NO_LABELS, tolerance)])
     table = _judged(table, [column.name for column in features])
     kept = table[table["reason"] == ""]
     order = ["group", "path", "arc_length", "x", "y", "z"]
@@ -233,6 +231,10 @@ def join(
         dict(made_with or {}),
         {name: dict(data) for name, data in (data_sets or {}).items()},
     )
+
+
+_LABELLED = ("sample", "x", "y", "z", "error_mean", "status", "reason")
+_NO_LABELS = pd.DataFrame({name: [] for name in _LABELLED})
 
 
 def _places(factors: pd.DataFrame, block: float) -> pd.DataFrame:
@@ -269,9 +271,7 @@ def _joined(
     places: pd.DataFrame, group: str, labels: pd.DataFrame, tolerance: float
 ) -> pd.DataFrame:
     """The labels of one group with the columns of their place, and why a row is no pair."""
-    _require(
-        labels, ("sample", "x", "y", "z", "error_mean", "status", "reason"), f"group {group!r}"
-    )
+    _require(labels, _LABELLED, f"group {group!r}")
     if labels["sample"].duplicated().any():
         sample = labels.loc[labels["sample"].duplicated(), "sample"].iloc[0]
         raise UsageError(f"group {group!r} has sample {sample} twice: was a file read twice?")
@@ -284,13 +284,12 @@ def _joined(
     distance, second, place = _nearest(places[["x", "y", "z"]].to_numpy(np.float64), at)
     open_ = reason == ""
     reason[open_ & ~(distance <= tolerance)] = "no sample point within the tolerance"
-    reason[(reason == "") & (second - distance <= SAME)] = "two sample points equally near"
+    reason[(reason == "") & (second <= distance + SAME)] = "two sample points equally near"
     _nearest_scan_only(reason, place, distance)
-    wanted = [n for n in (*TARGETS, "sample", "true_pose", "as_sensor", "status") if n in labels]
+    kept = [n for n in (*TARGETS, "sample", "true_pose", "as_sensor", "status") if n in labels]
     here = places.iloc[np.minimum(place, len(places) - 1)].reset_index(drop=True)
-    extra = {"true_pose": "", "as_sensor": ""} | {"group": group, "distance": distance}
-    frame = here.assign(**extra)
-    for name in wanted:
+    frame = here.assign(true_pose="", as_sensor="", group=group, distance=distance)
+    for name in kept:
         frame[name] = labels[name].to_numpy()
     return frame.assign(reason=reason, detail=detail.to_numpy())
 

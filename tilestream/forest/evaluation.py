@@ -68,16 +68,16 @@ def figures(actual: Float64, estimate: Float64, median: Float64) -> Figures:
     error = np.abs(estimate - actual)
     spread = float(((actual - actual.mean()) ** 2).sum())
     of_median = float(np.abs(median - actual).mean())
-    varied = np.ptp(actual) > 0.0 and np.ptp(estimate) > 0.0
+    vary, both_vary = np.ptp(actual) > 0.0, np.ptp(actual) > 0.0 and np.ptp(estimate) > 0.0
     return Figures(
         points=len(actual),
         rmse=float(np.sqrt((error**2).mean())),
         mae=float(error.mean()),
         within_25mm=float((error < 0.025).mean()),
         within_50mm=float((error < 0.05).mean()),
-        r2=1.0 - float((error**2).sum()) / spread if spread > 0.0 else float("nan"),
+        r2=1.0 - float((error**2).sum()) / spread if vary else float("nan"),
         skill=1.0 - float(error.mean()) / of_median if of_median > 0.0 else float("nan"),
-        spearman=float(spearmanr(actual, estimate).statistic) if varied else float("nan"),
+        spearman=float(spearmanr(actual, estimate).statistic) if both_vary else float("nan"),
     )
 
 

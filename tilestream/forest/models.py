@@ -23,8 +23,6 @@ LENGTHS = ("error_mean", "error_floor", "along_mean", "across_mean", "up_mean")
 """Targets that are positive lengths, whose logarithm a forest may learn."""
 LEAST = 1e-4
 """Errors below this count as this, before a logarithm [m]."""
-LEAVES = (2, 8, 32)
-"""Sizes of a leaf among which the tuned forest chooses."""
 CM_PER_M = 100.0
 FOOTPRINT = (
     "feature_count",
@@ -58,8 +56,10 @@ class Recipe:
 
 PAPER = Recipe()
 """scikit-learn's defaults: the paper's forest."""
-TUNABLE = Recipe(leaf=8, share=1.0 / 3.0, log=True)
-"""The default forest, before its leaf is chosen; and as it is where there are no blocks."""
+CAUTIOUS = Recipe(leaf=8, share=1.0 / 3.0, log=True)
+"""The default forest where there are no blocks to choose on."""
+CANDIDATES = (Recipe(leaf=2, log=True), CAUTIOUS, replace(CAUTIOUS, leaf=32))
+"""Forests among which the default is chosen: for factors that tell much, some, or little."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,18 +107,17 @@ def grow(
 def tuned(
     dataset: Dataset, target: str = "error_mean", seed: int = 0, n_jobs: int | None = 1
 ) -> Recipe:
-    """The default forest: its leaf is the one with the least mean error on held-out blocks.
+    """The default forest: the candidate with the least mean error on held-out blocks.
 
     The blocks are of `dataset` alone, so tuning within a training part sees nothing of what judges
-    it. Where there are too few blocks, `TUNABLE` as it is.
+    it. Where there are too few blocks, `CAUTIOUS`.
     """
     try:
         splits = block_splits(dataset, folds=3)
     except ModelError:
-        return TUNABLE
-    recipes = [replace(TUNABLE, leaf=leaf) for leaf in LEAVES]
-    errors = [_held_out_error(dataset, splits, target, r, seed, n_jobs) for r in recipes]
-    return recipes[int(np.argmin(errors))]
+        return CAUTIOUS
+    errors = [_held_out_error(dataset, splits, target, r, seed, n_jobs) for r in CANDIDATES]
+    return CANDIDATES[int(np.argmin(errors))]
 
 
 def _held_out_error(

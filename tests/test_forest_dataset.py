@@ -1,0 +1,240 @@
+"""Factors and errors are joined by place; what is lost is counted; the judged are far away."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from forest_data import COLUMNS, WEAK_AXIS, dataset, drives
+
+from tilestream.errors import ModelError, UsageError
+from tilestream.forest.dataset import PLACE, TARGETS, Dataset, features_of, join, made_with
+from tilestream.forest.evaluation import factor_sets
+from tilestream.forest.protocols import PROTOCOLS, block_splits, leave_path_out, random_split
+from tilestream.sensors import VLP16
+
+SHORT = {"a": 260, "b": 410, "c": 90}
+
+
+@pytest.fixture(scope="module")
+def short() -> tuple[pd.DataFrame, pd.DataFrame]:
+    return drives(3, SHORT)
+
+
+def test_rows_are_joined_by_place_and_not_by_order(
+    short: tuple[pd.DataFrame, pd.DataFrame],
+) -> None:
+    factors, labels = short
+    rng = np.random.default_rng(0)
+    near = labels.assign(x=labels["x"] + rng.uniform(-0.3, 0.3, len(labels)))
+    plain = join(factors, {"drive": near}, COLUMNS)
+    mixed = join(factors.sample(frac=1.0, random_state=1), {"drive": near[::-1]}, COLUMNS)
+    pd.testing.assert_frame_equal(plain.rows, mixed.rows)
+    assert len(plain) == sum(SHORT.values())
+    want = dict(
+        zip(zip(labels["y"], labels["arc_length"], strict=True), labels["error_mean"], strict=True)
+    )
+    for row in plain.rows.itertuples():
+        assert row.error_mean == want[(row.y, row.arc_length)]
+    assert plain.losses == {}
+
+
+def test_a_label_that_finds_no_place_is_counted_with_its_reason(
+    short: tuple[pd.DataFrame, pd.DataFrame],
+) -> None:
+    factors, labels = short[0].copy(), short[1].copy()
+    factors.loc[5, "score_H"] = np.nan
+    factors.loc[6, ["status", "reason"]] = ["missing", "no map here"]
+    labels.loc[10, ["status", "reason"]] = ["failed", "no cell in reach"]
+    labels.loc[20, "y"] += 0.6
+    labels.loc[30, "x"] += 0.5
+    labels.loc[40, "error_mean"] = np.nan
+    labels.loc[50, "x"] = labels.loc[51, "x"] + 0.2
+    labels.loc[60, "x"] = np.nan
+    labels.loc[70, "x"] += 0.6
+    labels.loc[71, "x"] -= 0.4
+    found = join(factors, {"drive": labels}, COLUMNS)
+    assert found.losses == {
+        "factor score_H is not a number": 1,
+        "no factors at the sample point": 1,
+        "label failed": 1,
+        "no sample point within the tolerance": 1,
+        "two sample points equally near": 1,
+        "label error_mean is not a number": 1,
+        "another scan is nearer to the sample point": 1,
+        "label without a position": 1,
+        "two scans equally near to the sample point": 2,
+    }
+    assert len(found) + sum(found.losses.values()) == len(labels)
+    details = dict(zip(found.lost["reason"], found.lost["detail"], strict=True))
+    assert details["label failed"] == "no cell in reach"
+    assert details["no factors at the sample point"] == "no map here"
+
+
+def test_several_drives_over_one_place_are_kept_apart(
+    short: tuple[pd.DataFrame, pd.DataFrame],
+) -> None:
+    factors, labels = short
+    again = labels.assign(error_mean=labels["error_mean"] + 0.01)
+    both = join(factors, {"one": labels, "two": again}, COLUMNS)
+    assert len(both) == 2 * len(labels)
+    assert both.rows.groupby("group").size().to_dict() == {"one": len(labels), "two": len(labels)}
+    one = both.groups(["one"])
+    assert np.array_equal(one.label(), join(factors, {"one": labels}, COLUMNS).label())
+    with pytest.raises(UsageError, match="no group 'three'; there are one, two"):
+        both.groups(["three"])
+
+
+def test_labels_of_different_making_are_never_mixed(
+    short: tuple[pd.DataFrame, pd.DataFrame],
+) -> None:
+    factors, labels = short
+    identities = {"one": {"solver": "raw"}, "two": {"solver": "definite"}}
+    mixed = join(factors, {"one": labels, "two": labels}, COLUMNS, data_sets=identities)
+    with pytest.raises(ModelError, match="'one' and 'two' were labelled with different solver"):
+        mixed.check()
+    mixed.groups(["one"]).check()
+    refined = {"one": labels.assign(true_pose="log"), "two": labels.assign(true_pose="refined")}
+    with pytest.raises(ModelError, match="different true_pose"):
+        join(factors, refined, COLUMNS).check()
+
+
+def test_position_name_and_heading_are_never_features() -> None:
+    factors, labels = drives(0, SHORT, columns=(*COLUMNS, WEAK_AXIS))
+    catalogue = (
+        *COLUMNS,
+        WEAK_AXIS,
+        *(type(WEAK_AXIS)(name, "place", "m", "", "") for name in PLACE),
+    )
+    found = join(factors, {"drive": labels}, catalogue)
+    assert not {*PLACE, "path", "block", "group", "sample", "distance", "weak_axis"} & set(
+        found.names
+    )
+    assert not set(TARGETS) & set(found.names)
+    assert "weak_along" in found.names
+    turned = factors.assign(heading=factors["heading"] + 1.0, weak_axis=factors["weak_axis"] + 1.0)
+    elsewhere = turned.assign(x=turned["x"] + 5e4, route_id="other " + turned["route_id"])
+    moved = labels.assign(x=labels["x"] + 5e4)
+    there = join(elsewhere, {"drive": moved}, catalogue)
+    assert np.allclose(there.matrix(), found.matrix(), rtol=0, atol=1e-12)
+    assert [c.name for c in features_of(catalogue)] == found.names
+
+
+def test_blocks_are_at_least_200_m_and_whole_paths_if_shorter() -> None:
+    found = dataset(1, lengths={"a": 199, "b": 401, "c": 700})
+    lengths = found.rows.groupby("block")["arc_length"].agg(np.ptp)
+    assert list(lengths.index) == ["a#00", "b#00", "b#01", "c#00", "c#01", "c#02"]
+    assert (lengths[1:] >= 199.0).all()
+
+
+def test_blocks_do_not_depend_on_what_was_lost(short: tuple[pd.DataFrame, pd.DataFrame]) -> None:
+    factors, labels = short
+    whole = join(factors, {"drive": labels}, COLUMNS).rows.set_index(["path", "arc_length"])
+    part = join(factors, {"drive": labels[100:500]}, COLUMNS).rows.set_index(["path", "arc_length"])
+    assert (part["block"] == whole.loc[part.index, "block"]).all()
+
+
+def test_every_point_is_judged_once_and_far_from_what_trained() -> None:
+    found = dataset(2, lengths={"a": 650, "b": 400, "c": 300})
+    at = found.rows[["x", "y"]].to_numpy()
+    for splits in (leave_path_out(found), block_splits(found)):
+        judged = np.concatenate([split.test for split in splits])
+        assert np.array_equal(np.sort(judged), np.arange(len(found)))
+        for split in splits:
+            apart = np.abs(at[split.train, None] - at[None, split.test])
+            assert np.hypot(apart[..., 0], apart[..., 1]).min() > 100.0
+    paths = found.rows["path"].to_numpy()
+    for split in leave_path_out(found):
+        assert not set(paths[split.train]) & set(paths[split.test])
+
+
+def test_a_street_driven_twice_is_no_other_street() -> None:
+    factors, labels = drives(4, {"a": 300, "b": 300})
+    beside = factors["route_id"] == "b"
+    factors.loc[beside, "y"] = factors["y"].iloc[0] + 5.0
+    labels["y"] = factors["y"]
+    found = join(factors, {"drive": labels}, COLUMNS)
+    with pytest.raises(ModelError, match="path a: 0 points lie beyond 100 m"):
+        leave_path_out(found)
+
+
+def test_the_random_split_is_the_papers() -> None:
+    found = dataset(0)
+    (split,) = random_split(found, 7)
+    assert (len(split.train), len(split.test)) == (2709, 903)
+    assert np.array_equal(np.sort(np.r_[split.train, split.test]), np.arange(3612))
+    assert not np.array_equal(split.test, random_split(found, 8)[0].test)
+    assert [protocol.name for protocol in PROTOCOLS] == ["paper", "path", "blocks"]
+
+
+def test_the_tails_are_the_papers() -> None:
+    errors = np.concatenate([dataset(seed, related=0.0).label() for seed in range(4)])
+    for limit, share in ((0.10, 0.419), (0.15, 0.178), (0.20, 0.0845), (0.25, 0.0431)):
+        assert abs((errors > limit).mean() - share) < 0.05
+
+
+def test_factor_sets_grow_by_the_papers_criteria() -> None:
+    sets = factor_sets((*COLUMNS, WEAK_AXIS))
+    assert {name: len(columns) for name, columns in sets.items()} == {
+        "FS": 8,
+        "FS+RQ": 10,
+        "FS+RQ+LY": 16,
+        "FS+RQ+LY+LS": 20,
+        "all + robust": 21,
+    }
+    assert "all + robust" not in factor_sets(COLUMNS)
+
+
+def test_what_factors_were_made_with_is_remembered() -> None:
+    facts = made_with(COLUMNS, VLP16, 2.0)
+    assert facts["sensor"]["name"] == "VLP16"
+    assert facts["cell_size"] == 2.0
+    assert facts["units"]["FDOP"] == "1"
+
+
+def small(**changes: object) -> Dataset:
+    factors, labels = drives(0, {"a": 60, "b": 60})
+    return join(factors, {"drive": labels.assign(**changes)}, COLUMNS)
+
+
+def test_what_nothing_can_be_learnt_from_is_refused() -> None:
+    with pytest.raises(ModelError, match=r"error_mean is 0\.1 at all 120 points"):
+        small(error_mean=0.1).check()
+    factors, labels = drives(0, {"a": 60, "b": 60})
+    few = join(factors, {"drive": labels.iloc[:49]}, COLUMNS)
+    with pytest.raises(ModelError, match="49 labelled points, and a model needs 50"):
+        few.check()
+    lonely = join(factors, {"drive": labels.iloc[:61]}, COLUMNS)
+    with pytest.raises(ModelError, match="path 'b' has one point only"):
+        lonely.check()
+    with pytest.raises(ModelError, match="one block only"):
+        block_splits(few)
+    with pytest.raises(ModelError, match="one path only"):
+        leave_path_out(few)
+    with pytest.raises(ModelError, match="the labels have no nonsense"):
+        few.label("nonsense")
+
+
+def test_broken_tables_are_refused(short: tuple[pd.DataFrame, pd.DataFrame]) -> None:
+    factors, labels = short
+    with pytest.raises(UsageError, match=r"two rows of route 'a' at 0 m"):
+        join(pd.concat([factors, factors.iloc[:1]]), {"drive": labels}, COLUMNS)
+    with pytest.raises(UsageError, match="group 'drive' has sample 0 twice"):
+        join(factors, {"drive": pd.concat([labels, labels.iloc[:1]])}, COLUMNS)
+    with pytest.raises(UsageError, match="the factor table has no column heading"):
+        join(factors.drop(columns="heading"), {"drive": labels}, COLUMNS)
+    with pytest.raises(UsageError, match="group 'drive' has no column error_mean"):
+        join(factors, {"drive": labels.drop(columns="error_mean")}, COLUMNS)
+    with pytest.raises(UsageError, match="none of the catalogue's factors"):
+        join(factors[[*PLACE, "status", "reason"]], {"drive": labels}, COLUMNS)
+    with pytest.raises(UsageError, match="give positive lengths"):
+        join(factors, {"drive": labels}, COLUMNS, tolerance=0.0)
+
+
+def test_no_labels_is_an_empty_table_that_says_so(
+    short: tuple[pd.DataFrame, pd.DataFrame],
+) -> None:
+    factors, labels = short
+    for groups in ({}, {"drive": labels.iloc[:0]}, {"drive": labels.assign(x=0.0)}):
+        found = join(factors, groups, COLUMNS)
+        assert len(found) == 0
+        with pytest.raises(ModelError, match="0 labelled points"):
+            found.check()

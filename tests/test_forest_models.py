@@ -1,0 +1,258 @@
+"""Forests, opponents and protocols: what is claimed, and that the random split proves nothing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from forest_data import COLUMNS, dataset, drives, labels_of
+from sklearn.ensemble import RandomForestRegressor
+
+from tilestream.errors import ModelError
+from tilestream.forest import evaluation
+from tilestream.forest.dataset import Dataset, join
+from tilestream.forest.evaluation import (
+    PAPER_TABLE,
+    ceiling,
+    compare,
+    criterion_importances,
+    figures,
+    figures_of,
+    held_out,
+    importances,
+    table_iv,
+)
+from tilestream.forest.intervals import calibrate, coverage
+from tilestream.forest.models import (
+    CANDIDATES,
+    CAUTIOUS,
+    COMPETITORS,
+    FOOTPRINT,
+    PAPER,
+    Recipe,
+    grow,
+    tuned,
+)
+from tilestream.forest.protocols import Split, block_splits, leave_path_out, random_split
+
+THREE = {"a": 420, "b": 420, "c": 420}
+QUICK = Recipe(trees=20)
+
+
+@pytest.fixture(scope="module")
+def unrelated() -> Dataset:
+    found = dataset(5, related=0.0, lengths=THREE)
+    return found.with_columns(found.columns[:8])
+
+
+@pytest.fixture(scope="module")
+def caused() -> Dataset:
+    """Labels that follow from three factors, which vary fast enough to be learnt in 600 points."""
+    factors, labels = drives(6, {"a": 210, "b": 210, "c": 210})
+    for table in (factors, labels):
+        table["arc_length"] *= 2.0
+        table["x"] += 0.5 * table["arc_length"]
+    rng = np.random.default_rng(6)
+    names = [column.name for column in COLUMNS]
+    values = rng.normal(size=(len(factors), len(names)))
+    factors[names] = values
+    shape = (values[:, 0] - values[:, -1] + values[:, 9]) / np.sqrt(3.0)
+    labels = labels.assign(**labels_of(0.09 * np.exp(0.6 * shape)))
+    return join(factors, {"drive": labels}, COLUMNS)
+
+
+def test_irrelevant_smooth_factors_shine_on_the_random_split_and_fail_on_blocks(
+    unrelated: Dataset,
+) -> None:
+    at_random = figures_of(held_out(unrelated, random_split(unrelated), "paper"))
+    assert at_random.mae < 0.0283
+    assert at_random.within_25mm > 0.641
+    assert at_random.skill > 0.5
+    for splits in (leave_path_out(unrelated), block_splits(unrelated, folds=3)):
+        apart = figures_of(held_out(unrelated, splits, "paper"))
+        assert apart.skill <= 0.0
+        assert apart.mae > 2.0 * at_random.mae
+
+
+def test_related_factors_are_learnt_across_paths(caused: Dataset) -> None:
+    splits = leave_path_out(caused)
+    paper = figures_of(held_out(caused, splits, "paper"))
+    ours = figures_of(held_out(caused, splits, "default"))
+    assert ours.skill > 0.3
+    assert ours.spearman > 0.8
+    assert ours.mae < 1.1 * paper.mae
+    for name in ("training median", "path median", "nearest training point", "footprint forest"):
+        assert figures_of(held_out(caused, splits, name)).mae > ours.mae, name
+
+
+def test_the_papers_forest_is_scikit_learns_own(caused: Dataset) -> None:
+    plain = RandomForestRegressor(random_state=3).fit(caused.matrix(), caused.label())
+    ours = grow(caused, "error_mean", PAPER, seed=3)
+    assert np.array_equal(ours.estimate(caused.matrix()), plain.predict(caused.matrix()))
+    assert PAPER.trees == 100
+
+
+def test_the_forest_is_chosen_on_held_out_blocks(caused: Dataset, unrelated: Dataset) -> None:
+    assert tuned(caused) == CANDIDATES[0]
+    assert tuned(unrelated) == CANDIDATES[-1]
+    assert tuned(caused.take(np.arange(80))) == CAUTIOUS
+
+
+def test_a_forest_of_logarithms_is_near_the_median() -> None:
+    factors, labels = drives(1, {"a": 300, "b": 300})
+    rng = np.random.default_rng(1)
+    labels["error_mean"] = 0.1 * np.exp(rng.normal(size=len(labels)))
+    found = join(factors, {"drive": labels}, COLUMNS)
+    leaf = replace(QUICK, leaf=150)
+    estimate = {
+        log: grow(found, "error_mean", replace(leaf, log=log)).estimate(found.matrix()).mean()
+        for log in (False, True)
+    }
+    assert abs(estimate[True] - np.median(found.label())) < 0.015
+    assert estimate[False] > 1.4 * estimate[True]
+
+
+@pytest.mark.parametrize("name", sorted(COMPETITORS))
+def test_every_competitor_estimates_what_it_has_not_seen(name: str, caused: Dataset) -> None:
+    rows = np.arange(len(caused))
+    split = Split("half", rows[::3], rows[1::3])
+    blind = replace(caused, rows=caused.rows.copy())
+    blind.rows.loc[split.test, "error_mean"] = -1.0
+    points = held_out(caused, [split], name)
+    assert np.isfinite(points["estimate"]).all()
+    assert np.array_equal(points["estimate"], held_out(blind, [split], name)["estimate"])
+    assert np.array_equal(points["actual"], caused.label()[split.test])
+
+
+def test_the_opponents_are_what_they_are_called() -> None:
+    found = dataset(8, lengths={"a": 100, "b": 100})
+    label, path = found.label(), found.rows["path"].to_numpy()
+    train, judged = np.flatnonzero(path == "a")[::10], np.flatnonzero(path == "a")
+    split = [Split("", train, judged)]
+    nearest = held_out(found, split, "nearest training point")["estimate"].to_numpy()
+    arc = found.rows["arc_length"].to_numpy()
+    for k, row in enumerate(judged):
+        gap = np.abs(arc[train] - arc[row])
+        assert nearest[k] in label[train][gap == gap.min()]
+    other = [Split("", train, np.flatnonzero(path == "b"))]
+    assert set(held_out(found, other, "nearest training point")["estimate"]) <= set(label[train])
+    median = held_out(found, other, "path median")["estimate"]
+    assert (median == np.median(label[train])).all()
+    both = [Split("", np.arange(len(found)), np.arange(len(found)))]
+    of_path = held_out(found, both, "path median").groupby("path")["estimate"].unique()
+    assert of_path["b"] == [np.median(label[path == "b"])]
+    assert len(FOOTPRINT) == 7
+    assert set(FOOTPRINT) <= {column.name for column in COLUMNS}
+
+
+def test_figures_by_hand() -> None:
+    actual = np.array([0.10, 0.20, 0.30, 0.40])
+    estimate = np.array([0.12, 0.20, 0.26, 0.50])
+    found = figures(actual, estimate, np.full(4, 0.25))
+    assert found.points == 4
+    assert found.mae == pytest.approx(0.04)
+    assert found.rmse == pytest.approx(np.sqrt((0.02**2 + 0.04**2 + 0.1**2) / 4))
+    assert (found.within_25mm, found.within_50mm) == (0.5, 0.75)
+    assert found.r2 == pytest.approx(1 - 0.012 / 0.05)
+    assert found.skill == pytest.approx(1 - 0.04 / 0.1)
+    assert found.spearman == pytest.approx(1.0)
+    same = figures(np.full(3, 0.1), np.full(3, 0.1), np.full(3, 0.1))
+    assert np.isnan([same.r2, same.skill, same.spearman]).all()
+    with pytest.raises(ModelError, match="no points to judge"):
+        figures(actual[:0], estimate[:0], estimate[:0])
+
+
+def test_table_iv_has_every_protocol_and_factor_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(
+        evaluation.COMPETITORS,
+        "quick",
+        lambda train, judged, target, seed: grow(train, target, QUICK, seed).estimate(
+            judged.matrix()
+        ),
+    )
+    found = dataset(2, related=0.9, lengths={"a": 410, "b": 300})
+    table = table_iv(found, "quick")
+    assert len(table) == 3 * 4
+    assert list(table["factors"].unique()) == list(PAPER_TABLE["factors"])
+    assert (table["reason"] == "").all()
+    assert np.isfinite(table["mae"]).all()
+    judged = table.groupby("protocol")["points"].first().to_dict()
+    assert judged == {"paper": 178, "path": 710, "blocks": 710}
+
+
+def test_a_protocol_that_cannot_be_followed_says_why() -> None:
+    table = compare(dataset(2, lengths={"a": 120}), ["training median"])
+    reasons = dict(zip(table["protocol"], table["reason"], strict=True))
+    assert reasons["paper"] == ""
+    assert "one path only" in reasons["path"]
+    assert "one block only" in reasons["blocks"]
+    assert table.loc[table["protocol"] != "paper", "mae"].isna().all()
+
+
+def test_the_ceiling_is_a_repeated_drive() -> None:
+    factors, labels = drives(1, {"a": 200})
+    again = labels.assign(error_mean=labels["error_mean"] + 0.01)
+    both = join(factors, {"one": labels, "two": again}, COLUMNS)
+    found = ceiling(both)
+    assert found.points == 400
+    assert found.mae == pytest.approx(0.01)
+    assert found.skill > 0.5
+    with pytest.raises(ModelError, match="no place was driven twice"):
+        ceiling(both.groups(["one"]))
+
+
+def test_importances_find_the_causes(caused: Dataset) -> None:
+    own = importances(caused, recipe=QUICK).set_index("factor")
+    assert own["importance"].sum() == pytest.approx(1.0)
+    causes = {COLUMNS[0].name, COLUMNS[9].name, COLUMNS[-1].name}
+    assert set(own["importance"].nlargest(3).index) == causes
+    by_criterion = criterion_importances(caused, recipe=QUICK).set_index("criterion")
+    assert list(by_criterion.index) == ["FS", "RQ", "LY", "LS"]
+    assert by_criterion["factors"].sum() == len(COLUMNS)
+    assert (by_criterion.loc[["FS", "RQ", "LS"], "increase"] > 0.005).all()
+    assert abs(by_criterion.loc["LY", "increase"]) < 0.003
+
+
+def test_intervals_hold_for_new_blocks() -> None:
+    rng = np.random.default_rng(0)
+    held = []
+    for _ in range(200):
+        bias = rng.normal(size=(21, 1))
+        score = 0.5 * bias + 0.3 * rng.normal(size=(21, 40))
+        actual, estimate = 0.1 * np.exp(score), np.full((21, 40), 0.1)
+        block = np.repeat([f"b{k}" for k in range(20)], 40)
+        interval = calibrate(actual[:20].ravel(), estimate[:20].ravel(), block)
+        low, high = interval.around(estimate[20])
+        held.append(((low <= actual[20]) & (actual[20] <= high)).mean())
+    assert interval.level == 0.9
+    assert 0.88 < np.mean(held) < 0.97
+
+
+def test_few_blocks_lower_the_level_and_one_gives_none() -> None:
+    actual, estimate = np.array([0.1, 0.2, 0.4, 0.1]), np.full(4, 0.1)
+    interval = calibrate(actual, estimate, np.array(["a", "a", "b", "b"]))
+    assert interval.level == pytest.approx(2 / 3)
+    assert interval.factor == pytest.approx(4.0)
+    assert interval.around(np.array([0.2])) == (pytest.approx(0.05), pytest.approx(0.8))
+    alone = calibrate(actual, estimate, np.array(["a"] * 4))
+    assert alone.blocks == 0
+    assert np.isnan([alone.level, alone.factor, *np.ravel(alone.around(estimate))]).all()
+
+
+def test_coverage_of_a_path_is_calibrated_elsewhere() -> None:
+    def points(error: float) -> pd.DataFrame:
+        path = np.repeat(["a", "b", "c"], 4)
+        return pd.DataFrame(
+            {
+                "path": path,
+                "block": [f"{p}#{k % 2}" for k, p in enumerate(path)],
+                "actual": np.where(path == "c", error, 0.12),
+                "estimate": 0.1,
+            }
+        )
+
+    assert coverage(points(0.11))["covered"].tolist() == [1.0, 1.0, 1.0]
+    found = coverage(points(0.5)).set_index("path")
+    assert found.loc["c", "covered"] == 0.0
+    assert found.loc["c", "factor"] == pytest.approx(1.2)
+    assert found.loc["a", "covered"] == 1.0
