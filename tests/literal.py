@@ -10,8 +10,9 @@ the definitions cannot see, so that coordinates of 4e6 m cost no digits.
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +45,8 @@ def voxel_groups(points_mm: Ints, edge_mm: int) -> Iterator[tuple[Ints, Ints]]:
     voxels, voxel_of = np.unique(points_mm // edge_mm, axis=0, return_inverse=True)
     by_voxel = np.argsort(voxel_of.ravel(), kind="stable")
     ends = np.cumsum(np.bincount(voxel_of.ravel(), minlength=len(voxels)))
-    yield from zip(voxels, np.split(by_voxel, ends[:-1]), strict=True)
+    if len(voxels):
+        yield from zip(voxels, np.split(by_voxel, ends[:-1]), strict=True)
 
 
 def thinned_mm(points_mm: Ints, edge_mm: int) -> Ints:
@@ -77,6 +79,8 @@ class LiteralCells:
     """(m, 3) raw, lam1 >= lam2 >= lam3 >= 0."""
     regularised: Floats
     """(m, 3, 3) same eigenvectors, floored eigenvalues."""
+    precision: Floats
+    """(m, 3, 3) inverses of the regularised covariances."""
     normal: Floats
     dimension: Ints
     """(m,) 1, 2 or 3: the shape class."""
@@ -134,12 +138,13 @@ def cells_of_mm(points_mm: Ints, edge_mm: int) -> tuple[LiteralCells, Ints]:
                 covariance,
                 lam,
                 axes @ np.diag(floored) @ axes.T,
+                axes @ np.diag(1.0 / floored) @ axes.T,
                 normal_of(lam, axes[:, 0], axes[:, 2]),
                 dimension_of(lam),
             )
         )
-    shapes = ((3,), (), (3,), (3, 3), (3,), (3, 3), (3,), ())
-    kinds = (np.int64, np.int64, *[np.float64] * 5, np.int64)
+    shapes = ((3,), (), (3,), (3, 3), (3,), (3, 3), (3, 3), (3,), ())
+    kinds = (np.int64, np.int64, *[np.float64] * 6, np.int64)
     columns = zip(*rows, strict=True) if rows else [()] * len(shapes)
     arrays = [
         np.array(column, kind).reshape(-1, *shape)
@@ -267,15 +272,23 @@ class View:
         return self.world.points[np.isin(self.world.cell_of_point, self.members)]
 
 
-def view_from(world: World, P: Floats, sensor: Sensor) -> View:
-    """The cells with 0 < |mu - P| <= R and an elevation within the field of view."""
-    place = np.asarray(P, np.float64) - world.origin
-    rays = world.cells.mean - place
+def in_view(place: Floats, targets: Floats, sensor: Sensor) -> Ints:
+    """Numbers of the targets with 0 < |t - P| <= R and an elevation within the field of view.
+
+    A target within 1e-9 m is at P: at UTM coordinates no float64 can say it better.
+    """
+    rays = targets - place
     distance = np.linalg.norm(rays, axis=1)
-    near = np.flatnonzero((distance > 0.0) & (distance <= sensor.range_max))
+    near = np.flatnonzero((distance > TIE) & (distance <= sensor.range_max))
     low, high = np.radians(sensor.fov_deg)
     up = elevation(rays[near])
-    return View(world, place, sensor, near[(low <= up) & (up <= high)])
+    return near[(low <= up) & (up <= high)]
+
+
+def view_from(world: World, P: Floats, sensor: Sensor) -> View:
+    """The vicinity of a sample point (map frame): the cells in view."""
+    place = np.asarray(P, np.float64) - world.origin
+    return View(world, place, sensor, in_view(place, world.cells.mean, sensor))
 
 
 # --- 3. The 20 factors
@@ -351,8 +364,9 @@ def nearest_cells(world: World, x: Floats, limit: float = math.inf) -> tuple[Flo
     distance, cell = world.means.query(x, k=2, distance_upper_bound=reach)
     tied = np.isfinite(distance[:, 1]) & (distance[:, 1] <= distance[:, 0] + TIE)
     nearest = cell[:, 0].astype(np.int64)
-    for i in np.flatnonzero(tied):
-        nearest[i] = min(world.means.query_ball_point(x[i], distance[i, 0] + TIE))
+    rival_distance, rivals = world.means.query(x[tied], k=8)  # a lattice has no more in one place
+    level = rival_distance <= rival_distance[:, :1] + TIE
+    nearest[tied] = np.where(level, rivals, len(world.cells)).min(axis=1)
     far = np.vstack([world.cells.mean, np.full(3, np.inf)])
     length = np.linalg.norm(x - far[nearest], axis=1)
     outside = length > limit
@@ -362,8 +376,7 @@ def nearest_cells(world: World, x: Floats, limit: float = math.inf) -> tuple[Flo
 def squared_mahalanobis(world: World, x: Floats, cell: Ints) -> Floats:
     """(x - mu)^T Sigma'^-1 (x - mu), regularised covariance."""
     y = x - world.cells.mean[cell]
-    inverse = np.linalg.inv(world.cells.regularised)[cell]
-    return np.einsum("ni,nij,nj->n", y, inverse, y)
+    return np.einsum("ni,nij,nj->n", y, world.cells.precision[cell], y)
 
 
 def euclidean_dist(view: View) -> float:
@@ -420,6 +433,7 @@ def score_of_shift(world: World, x: Floats, shift: tuple[float, float]) -> Float
     return score
 
 
+@cache
 def score_field(view: View) -> Floats:
     """(441,) sum of the vicinity points' scores per shift, i slowest."""
     x = view.points
@@ -508,6 +522,206 @@ def bhatt_sim(view: View) -> float:
     return float(sum(bhattacharyya(cells, c, neighbours(cells, c)).sum() for c in view.members))
 
 
+# --- 4. The robust set: formulas as the catalogue of columns documents them
+
+
+def shape_shares(view: View) -> Floats:
+    """(N, 3) a1, a2, a3 of the cells of the vicinity; (0, 0, 1) where s1 <= 1e-6 m."""
+    rows = []
+    for s1, s2, s3 in np.sqrt(view.world.cells.eigenvalues[view.members]):
+        rows.append(((s1 - s2) / s1, (s2 - s3) / s1, s3 / s1) if s1 > 1e-6 else (0.0, 0.0, 1.0))
+    return np.array(rows)
+
+
+def D1_share(view: View) -> float:
+    return float(shape_shares(view)[:, 0].mean())
+
+
+def D2_share(view: View) -> float:
+    return float(shape_shares(view)[:, 1].mean())
+
+
+def D3_share(view: View) -> float:
+    return float(shape_shares(view)[:, 2].mean())
+
+
+def loose_share(view: View) -> float:
+    """Points of voxels with too few for a cell, whose mean is in view, among all points in view."""
+    world = view.world
+    loose = world.points[world.cell_of_point < 0]
+    groups = voxel_groups(whole_mm(loose), round(world.cells.edge * 1000))
+    centres = [(loose[group].mean(axis=0), len(group)) for _, group in groups]
+    seen = sum(n for centre, n in centres if len(in_view(view.place, centre[None], view.sensor)))
+    return seen / (seen + len(view.points))
+
+
+def dilution(directions: Floats) -> tuple[float, float]:
+    """sqrt(C_xx + C_yy) and sqrt(C_zz), C = (mean of d d^T)^-1; NaN: they do not span space."""
+    spread = directions.T @ directions / len(directions)
+    minors = (np.trace(spread) ** 2 - np.trace(spread @ spread)) / 2.0
+    if not np.linalg.det(spread) > 1e-6 * minors:
+        return math.nan, math.nan
+    C = np.linalg.inv(spread)
+    return math.sqrt(C[0, 0] + C[1, 1]), math.sqrt(C[2, 2])
+
+
+def sight_lines(view: View) -> Floats:
+    return view.rays / np.linalg.norm(view.rays, axis=1)[:, None]
+
+
+def normals_in_view(view: View) -> Floats:
+    return view.world.cells.normal[view.members]
+
+
+def sight_HDOP(view: View) -> float:
+    return dilution(sight_lines(view))[0]
+
+
+def sight_VDOP(view: View) -> float:
+    return dilution(sight_lines(view))[1]
+
+
+def normal_HDOP(view: View) -> float:
+    return dilution(normals_in_view(view))[0]
+
+
+def normal_VDOP(view: View) -> float:
+    return dilution(normals_in_view(view))[1]
+
+
+def standing(view: View) -> Flags:
+    """Which cells of the vicinity have |n_z| < 0.9."""
+    return np.abs(normals_in_view(view)[:, 2]) < 0.9
+
+
+def wall_H(view: View) -> float:
+    axes = azimuth(normals_in_view(view)[standing(view)]) % np.pi
+    counts = np.bincount(wrapped_bin(axes, 0.0, np.pi / 36, 36), minlength=36)
+    smooth = np.zeros(36)
+    for step, weight in ((-2, 1), (-1, 2), (0, 3), (1, 2), (2, 1)):
+        smooth += weight * np.roll(counts, step) / 9
+    return entropy(smooth)
+
+
+def structure_tensor(view: View) -> tuple[Floats, Floats]:
+    """Eigenvalues, rising, and eigenvectors of the sum of (n_x, n_y) (n_x, n_y)^T."""
+    flat = normals_in_view(view)[:, :2]
+    values, vectors = np.linalg.eigh(flat.T @ flat)
+    return np.maximum(values, 0.0), vectors
+
+
+def wall_major(view: View) -> float:
+    return float(structure_tensor(view)[0][1])
+
+
+def wall_minor(view: View) -> float:
+    return float(structure_tensor(view)[0][0])
+
+
+def wall_balance(view: View) -> float:
+    return wall_minor(view) / wall_major(view)
+
+
+def weak_axis(view: View) -> float:
+    """Direction of the smaller eigenvalue in [0, pi); NaN: neither is smaller (1e-9)."""
+    (minor, major), vectors = structure_tensor(view)
+    if major - minor <= 1e-9 * (major + minor):
+        return math.nan
+    return float(np.arctan2(vectors[1, 0], vectors[0, 0]) % np.pi)
+
+
+def empty_sector(view: View) -> float:
+    """The longest run of 4 deg bins without a standing cell, round the circle."""
+    around = azimuth(view.rays[standing(view)]) % (2 * np.pi)
+    occupied = np.unique(wrapped_bin(around, 0.0, 2 * np.pi / 90, 90))
+    if len(occupied) == 0:
+        return 2 * math.pi
+    gaps = np.diff(np.append(occupied, occupied[0] + 90)) - 1
+    return float(gaps.max() * np.radians(4.0))
+
+
+def mean_score(view: View) -> Floats:
+    """(21, 21) s(v): mean over the vicinity points of their scores; i is the row."""
+    return (score_field(view) / len(view.points)).reshape(21, 21)
+
+
+def softmax(view: View) -> Floats:
+    """(21, 21) P(v) ~ exp(s(v) / 0.05)."""
+    s = mean_score(view)
+    weight = np.exp((s - s.max()) / 0.05)
+    return weight / weight.sum()
+
+
+def score_soft_H(view: View) -> float:
+    return entropy(softmax(view).ravel())
+
+
+def curvature(view: View) -> Floats:
+    """Eigenvalues, rising, of -H in s(v) = c + g.v + v^T H v / 2, least squares on 5 x 5 shifts."""
+    s = mean_score(view)[8:13, 8:13].ravel()
+    x, y = (np.ravel(v) for v in np.meshgrid(*[np.arange(-2, 3) / 5] * 2, indexing="ij"))
+    design = np.column_stack([np.ones(25), x, y, x * x / 2, x * y, y * y / 2])
+    xx, xy, yy = np.linalg.lstsq(design, s)[0][3:]
+    return np.linalg.eigvalsh(-np.array([[xx, xy], [xy, yy]]))
+
+
+def score_curvature_min(view: View) -> float:
+    return float(curvature(view)[0])
+
+
+def score_curvature_max(view: View) -> float:
+    return float(curvature(view)[1])
+
+
+def score_peaks(view: View) -> float:
+    """Local maxima besides the highest with at least 0.01 of its P; equal: the first is higher."""
+    P = softmax(view)
+    peaks = 0
+    for i, j in np.ndindex(21, 21):
+        beside = [
+            (i + a, j + b)
+            for a in (-1, 0, 1)
+            for b in (-1, 0, 1)
+            if (a, b) != (0, 0) and 0 <= i + a < 21 and 0 <= j + b < 21
+        ]
+        higher = all(P[i, j] > P[k] or (P[i, j] == P[k] and (i, j) < k) for k in beside)
+        peaks += higher and P[i, j] >= 0.01 * P.max()
+    return peaks - 1.0
+
+
+def score_covariance(view: View) -> Floats:
+    P = softmax(view).ravel()
+    v = np.array(SHIFTS)
+    away = v - P @ v
+    return (away * P[:, None]).T @ away
+
+
+def score_cov_xx(view: View) -> float:
+    return float(score_covariance(view)[0, 0])
+
+
+def score_cov_xy(view: View) -> float:
+    return float(score_covariance(view)[0, 1])
+
+
+def score_cov_yy(view: View) -> float:
+    return float(score_covariance(view)[1, 1])
+
+
+def pfh_mean(view: View) -> float:
+    """pfh_sim_mnht per pair of neighbours that both have a histogram; no such pair: NaN."""
+    cells = view.world.cells
+    has = {c: literal_pfh(cells, c) is not None for c in range(len(cells))}
+    pairs = sum(has[c] and has[k] for c in view.members for k in neighbours(cells, c))
+    return pfh_sim_mnht(view) / pairs if pairs else math.nan
+
+
+def bhatt_mean(view: View) -> float:
+    """bhatt_sim per pair of neighbours; no pair: NaN."""
+    pairs = sum(len(neighbours(view.world.cells, c)) for c in view.members)
+    return bhatt_sim(view) / pairs if pairs else math.nan
+
+
 COUNTS = (feature_count, D1_count, D2_count, D3_count)
 FAITHFUL = (
     *COUNTS,
@@ -530,11 +744,40 @@ FAITHFUL = (
 )
 
 
-def factors_of(view: View) -> dict[str, float]:
-    """The 20 factors in the order of the table; an empty vicinity: counts 0, the rest NaN."""
+ROBUST = (
+    D1_share,
+    D2_share,
+    D3_share,
+    loose_share,
+    sight_HDOP,
+    sight_VDOP,
+    normal_HDOP,
+    normal_VDOP,
+    wall_H,
+    wall_major,
+    wall_minor,
+    wall_balance,
+    weak_axis,
+    empty_sector,
+    score_soft_H,
+    score_curvature_min,
+    score_curvature_max,
+    score_peaks,
+    score_cov_xx,
+    score_cov_xy,
+    score_cov_yy,
+    pfh_mean,
+    bhatt_mean,
+)
+
+
+def factors_of(
+    view: View, which: tuple[Callable[[View], float], ...] = FAITHFUL
+) -> dict[str, float]:
+    """The factors in the order of the table; an empty vicinity: counts 0, the rest NaN."""
     if len(view.members) == 0:
-        return {f.__name__: 0.0 if f in COUNTS else math.nan for f in FAITHFUL}
-    return {factor.__name__: factor(view) for factor in FAITHFUL}
+        return {f.__name__: 0.0 if f in COUNTS else math.nan for f in which}
+    return {factor.__name__: factor(view) for factor in which}
 
 
 def literal_factors(

@@ -74,7 +74,8 @@ def plain_bin(mean: Floats, normal: Floats, i: int, j: int) -> int | None:
     w = np.cross(u, v)
     alpha = plain_fifth(v @ target, -1, 1)
     phi = plain_fifth(u @ d / length, -1, 1)
-    theta = plain_fifth(np.arctan2(w @ target, u @ target), -np.pi, np.pi)
+    sine, cosine = (x if abs(x) >= 1e-9 else 0.0 for x in (w @ target, u @ target))
+    theta = plain_fifth(np.arctan2(sine, cosine), -np.pi, np.pi)
     return 25 * alpha + 5 * phi + theta
 
 

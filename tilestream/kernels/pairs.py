@@ -22,13 +22,19 @@ def _fifth(x, low, width):  # type: ignore[no-untyped-def]
     return min(max(int(np.floor((x - low) / width + 1e-9)), 0), 4)
 
 
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _snapped(x):  # type: ignore[no-untyped-def]
+    """0 for magnitudes below 1e-9: on exact planes rounding would choose between -pi and pi."""
+    return 0.0 if abs(x) < 1e-9 else x
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def _pair_bin(mean, normal, i, j):  # type: ignore[no-untyped-def]
     """Bin of the Darboux angles of cells i and j, of which i comes first lexicographically.
 
     Source s: the cell with the larger |n.d| / |d|, i if they differ by <= 1e-9. With d from
     source to target t: u = n_s, v = d x u / |d x u|, w = u x v; alpha = v.n_t, phi = u.d / |d|,
-    theta = atan2(w.n_t, u.n_t).
+    theta = atan2(w.n_t, u.n_t), where magnitudes below 1e-9 are 0.
     """
     dx, dy, dz = mean[j, 0] - mean[i, 0], mean[j, 1] - mean[i, 1], mean[j, 2] - mean[i, 2]
     length = np.sqrt(dx * dx + dy * dy + dz * dz)
@@ -49,7 +55,8 @@ def _pair_bin(mean, normal, i, j):  # type: ignore[no-untyped-def]
     wx, wy, wz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
     alpha = vx * tx + vy * ty + vz * tz
     phi = (ux * dx + uy * dy + uz * dz) / length
-    theta = np.arctan2(wx * tx + wy * ty + wz * tz, ux * tx + uy * ty + uz * tz)
+    sine, cosine = wx * tx + wy * ty + wz * tz, ux * tx + uy * ty + uz * tz
+    theta = np.arctan2(_snapped(sine), _snapped(cosine))
     fifths = 5 * _fifth(alpha, -1.0, 0.4) + _fifth(phi, -1.0, 0.4)
     return 5 * fifths + _fifth(theta, -np.pi, 0.4 * np.pi)
 
