@@ -29,8 +29,10 @@ MERGE_VERSION = 2
 """Raise it when the points that a merge writes change: tiles made by another one are redone."""
 BYTES_PER_BLOCK_POINT = 160
 """Memory of a scatter task per point of its block: as read, float64, int64, grouped int32."""
-BYTES_PER_TILE_POINT = 64
-"""Memory of a merge task per point: read, ordered, keys and counts of an axis, the result."""
+BYTES_PER_TILE_POINT = 40
+"""Memory of a merge task per point of a strip: read, ordered, keys of an axis."""
+BYTES_PER_STORED_POINT = 32
+"""Memory of a merge task per point of the tile: the strips that are done, the tile, packed."""
 MAX_BINS = 2**22
 """Widest range of voxels along an axis that is counted as it is."""
 SORT_EDGE_MM = 1000

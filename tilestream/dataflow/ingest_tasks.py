@@ -8,6 +8,7 @@ from tilestream.dataflow.tasks import perform
 from tilestream.formats.base import SourceInfo, Span
 from tilestream.ingest import (
     BYTES_PER_BLOCK_POINT,
+    BYTES_PER_STORED_POINT,
     BYTES_PER_TILE_POINT,
     Fragment,
     Piece,
@@ -166,10 +167,11 @@ def plan_merge(
     for key in sorted(pieces):
         count = sum(piece.count for piece in pieces[key])
         batch = MAX_BLOCK_POINTS // 2
-        free = max(1, memory - BASE_BYTES - batch * 40 - count * 12)
+        fixed = BASE_BYTES + batch * 40 + count * BYTES_PER_STORED_POINT
+        free = max(1, memory - fixed)
         strips = min(MAX_STRIPS, -(-count * BYTES_PER_TILE_POINT // free))
         strips = strips if strips == 1 else min(MAX_STRIPS, 2 * strips)
-        promise = BASE_BYTES + batch * 40 + count * 12 + count * BYTES_PER_TILE_POINT // strips
+        promise = fixed + count * BYTES_PER_TILE_POINT // strips
         tasks.append(
             MergeTask(
                 store_url=store_url,
