@@ -6,9 +6,18 @@ import pytest
 from forest_data import COLUMNS, WEAK_AXIS, dataset, drives
 
 from tilestream.errors import ModelError, UsageError
-from tilestream.forest.dataset import PLACE, TARGETS, Dataset, features_of, join, made_with
+from tilestream.forest.dataset import (
+    PLACE,
+    TARGETS,
+    Dataset,
+    features_of,
+    join,
+    made_with,
+    with_derived,
+)
 from tilestream.forest.evaluation import factor_sets
 from tilestream.forest.protocols import PROTOCOLS, block_splits, leave_path_out, random_split
+from tilestream.records import Column
 from tilestream.sensors import VLP16
 
 SHORT = {"a": 260, "b": 410, "c": 90}
@@ -102,7 +111,7 @@ def test_position_name_and_heading_are_never_features() -> None:
     catalogue = (
         *COLUMNS,
         WEAK_AXIS,
-        *(type(WEAK_AXIS)(name, "place", "m", "", "") for name in PLACE),
+        *(Column(name, "place", "m", "", "") for name in PLACE),
     )
     found = join(factors, {"drive": labels}, catalogue)
     assert not {*PLACE, "path", "block", "group", "sample", "distance", "weak_axis"} & set(
@@ -116,6 +125,22 @@ def test_position_name_and_heading_are_never_features() -> None:
     there = join(elsewhere, {"drive": moved}, catalogue)
     assert np.allclose(there.matrix(), found.matrix(), rtol=0, atol=1e-12)
     assert [c.name for c in features_of(catalogue)] == found.names
+
+
+def test_factors_in_map_axes_are_turned_into_the_routes() -> None:
+    names = ("weak_axis", "score_cov_xx", "score_cov_xy", "score_cov_yy")
+    columns = tuple(Column(name, "LS", "1", "", "", "robust") for name in names)
+    assert [c.name for c in features_of(columns)] == [
+        "weak_along",
+        "score_var_along",
+        "score_var_across",
+    ]
+    heading, axis = 0.7, np.array([[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]])
+    C = axis @ np.diag([4.0, 1.0]) @ axis.T
+    row = {"heading": heading, "weak_axis": 0.7, "score_cov_xx": C[0, 0], "score_cov_yy": C[1, 1]}
+    found = with_derived(pd.DataFrame([row | {"score_cov_xy": C[0, 1]}])).iloc[0]
+    assert found["weak_along"] == pytest.approx(1.0)
+    assert (found["score_var_along"], found["score_var_across"]) == pytest.approx((4.0, 1.0))
 
 
 def test_blocks_are_at_least_200_m_and_whole_paths_if_shorter() -> None:

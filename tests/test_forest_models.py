@@ -94,7 +94,7 @@ def test_the_papers_forest_is_scikit_learns_own(caused: Dataset) -> None:
 
 def test_the_forest_is_chosen_on_held_out_blocks(caused: Dataset, unrelated: Dataset) -> None:
     assert tuned(caused) == CANDIDATES[0]
-    assert tuned(unrelated) == CANDIDATES[-1]
+    assert tuned(unrelated) in CANDIDATES[1:]
     assert tuned(caused.take(np.arange(80))) == CAUTIOUS
 
 

@@ -33,8 +33,6 @@ SAME = 1e-3
 """Distances this close are equal [m]: the resolution of the map."""
 POINTS_MIN = 50
 """Fewest labelled points that a model is trained on."""
-MAP_ANGLE = "weak_axis"
-"""A direction in the map names the street as a position does; `weak_along` takes its place."""
 WEAK_ALONG = Column(
     "weak_along",
     "LY",
@@ -43,6 +41,24 @@ WEAK_ALONG = Column(
     "abs(cos(weak_axis - heading))",
     "robust",
 )
+SPREAD_ALONG, SPREAD_ACROSS = (
+    Column(
+        f"score_var_{axis}",
+        "LS",
+        "m^2",
+        f"Variance of where the map's points would be found, {axis} the direction of travel.",
+        "u^T C u, C of score_cov_xx, _xy, _yy, u the direction",
+        "robust",
+    )
+    for axis in ("along", "across")
+)
+IN_MAP_AXES: dict[str, Column | None] = {
+    "weak_axis": WEAK_ALONG,
+    "score_cov_xx": SPREAD_ALONG,
+    "score_cov_yy": SPREAD_ACROSS,
+    "score_cov_xy": None,
+}
+"""Directions in the map name a street as its position does: these take their place."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,16 +185,26 @@ def made_with(columns: Sequence[Column], sensor: Sensor, cell_size: float) -> di
 
 
 def features_of(columns: Sequence[Column]) -> tuple[Column, ...]:
-    """The factors of a catalogue that may be features: `weak_along` instead of `weak_axis`."""
-    factors = [column for column in columns if column.criterion not in ("place", "label")]
-    return tuple(WEAK_ALONG if column.name == MAP_ANGLE else column for column in factors)
+    """The factors of a catalogue that may be features, map axes turned into the route's."""
+    factors = (column for column in columns if column.criterion not in ("place", "label"))
+    turned = (IN_MAP_AXES.get(column.name, column) for column in factors)
+    return tuple(column for column in turned if column is not None)
 
 
 def with_derived(factors: pd.DataFrame) -> pd.DataFrame:
-    """A factor table with `weak_along`, where it has `weak_axis` and `heading`."""
-    if not {MAP_ANGLE, "heading"} <= set(factors):
+    """A factor table with what is in map axes turned into the route's, by its `heading`."""
+    if "heading" not in factors:
         return factors
-    return factors.assign(weak_along=np.abs(np.cos(factors[MAP_ANGLE] - factors["heading"])))
+    heading = factors["heading"].to_numpy(np.float64)
+    c, s = np.cos(heading), np.sin(heading)
+    turned: dict[str, Float64] = {}
+    if "weak_axis" in factors:
+        turned["weak_along"] = np.abs(np.cos(factors["weak_axis"].to_numpy(np.float64) - heading))
+    if {"score_cov_xx", "score_cov_xy", "score_cov_yy"} <= set(factors):
+        xx, xy, yy = (factors[f"score_cov_{a}"].to_numpy(np.float64) for a in ("xx", "xy", "yy"))
+        turned["score_var_along"] = c * c * xx + 2.0 * c * s * xy + s * s * yy
+        turned["score_var_across"] = s * s * xx - 2.0 * c * s * xy + c * c * yy
+    return factors.assign(**turned)
 
 
 def join(
@@ -244,8 +270,8 @@ def _places(factors: pd.DataFrame, block: float) -> pd.DataFrame:
     if twice.any():
         row = factors[twice].iloc[0]
         raise UsageError(
-            f"the factor table has two rows of route {row['route_id']!r} at {row['arc_length']:g} m:"
-            " was a file read twice?"
+            f"the factor table has two rows of route {row['route_id']!r} at "
+            f"{row['arc_length']:g} m: was a file read twice?"
         )
     table = with_derived(factors).rename(
         columns={"route_id": "path", "status": "factor_status", "reason": "factor_reason"}

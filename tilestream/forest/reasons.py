@@ -31,6 +31,7 @@ SCATTERED = "surfaces that face every way, as foliage does"
 ONE_SIDE = "features on few sides only"
 ALL_SIDES = "features on every side"
 FLAT = "a matching score without a clear peak"
+MISTAKEN = "repeated structure, places that could be mistaken for this one"
 STEEP = "a matching score with a narrow peak"
 REPEATED = "repeated structure, neighbours look alike"
 IRREGULAR = "irregular structure, neighbours look unlike"
@@ -73,9 +74,17 @@ PHRASES: dict[str, tuple[str, str]] = {
     "weak_along": (ACROSS, ALONG),
     "empty_sector": (ALL_SIDES, ONE_SIDE),
     "score_H": (STEEP, FLAT),
+    "score_soft_H": (STEEP, FLAT),
+    "score_curvature_min": (FLAT, STEEP),
+    "score_curvature_max": (FLAT, STEEP),
+    "score_var_along": (ACROSS, ALONG),
+    "score_var_across": (ALONG, ACROSS),
+    "score_peaks": (STEEP, MISTAKEN),
     "pfh_sim_H": (REPEATED, IRREGULAR),
     "pfh_sim_mnht": (REPEATED, IRREGULAR),
     "bhatt_sim": (REPEATED, IRREGULAR),
+    "pfh_mean": (REPEATED, IRREGULAR),
+    "bhatt_mean": (REPEATED, IRREGULAR),
 }
 """What a value below, or above, that of a typical training place says about a place."""
 

@@ -163,7 +163,8 @@ def predict(
 
     Args:
         model: a trained or loaded model.
-        factors: a table with the model's factors; `heading` too where `weak_along` is one of them.
+        factors: a table with the model's factors; `heading` too where factors in map axes
+            are turned into the route's (`dataset.IN_MAP_AXES`).
         made_with: what these factors were computed with (`dataset.made_with`); compared with the
             model's. None: the caller vouches for it.
 

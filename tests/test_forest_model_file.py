@@ -1,0 +1,306 @@
+"""Estimates of every place: the same in any company, explained, refused where they cannot be."""
+
+import io
+import json
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import sklearn
+import skops.io
+from forest_data import COLUMNS, dataset, drives
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sklearn.linear_model import LinearRegression
+
+from tilestream.errors import ModelError, SourceNotFoundError, UsageError
+from tilestream.factors import catalogue
+from tilestream.forest import model_file, training
+from tilestream.forest.dataset import TARGETS, Dataset, features_of, join, made_with
+from tilestream.forest.domain import domain_of
+from tilestream.forest.model_file import load_model, save_model
+from tilestream.forest.models import Recipe, grow
+from tilestream.forest.reasons import PHRASES, contributions, in_words, phrase_of
+from tilestream.forest.training import PREDICTION_COLUMNS, Model, predict, train
+from tilestream.sensors import HDL64, VLP16
+
+MADE_WITH = made_with(COLUMNS, VLP16, 2.0)
+NAMES = [column.name for column in COLUMNS]
+THREE = {"a": 230, "b": 230, "c": 230}
+
+
+@pytest.fixture(scope="module")
+def learnt() -> Dataset:
+    found = dataset(1, related=0.9, lengths=THREE)
+    return replace(found, made_with=MADE_WITH, data_sets={"drive": {"solver": "raw", "leaf": 2.0}})
+
+
+@pytest.fixture(scope="module")
+def model(learnt: Dataset) -> Model:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training, "PAPER", Recipe(trees=15))
+        return train(learnt, recipe="paper")
+
+
+@pytest.fixture(scope="module")
+def places() -> pd.DataFrame:
+    return drives(2, {"d": 200})[0]
+
+
+def test_a_place_has_all_estimates(model: Model, places: pd.DataFrame) -> None:
+    found = predict(model, places, MADE_WITH)
+    assert list(found) == [column.name for column in PREDICTION_COLUMNS]
+    assert found.index.equals(places.index)
+    assert found.drop(columns=["reason"]).notna().all(axis=None)
+    assert (found["status"] == "done").all()
+    assert ((found["low"] < found["estimate"]) & (found["estimate"] < found["high"])).all()
+    assert found["p_fail"].between(0.0, 1.0).all()
+    assert np.allclose(found["floor"], 0.5 * found["estimate"], rtol=0.3)
+    assert (found["reason"] != "")[found["estimate"] > model.worst].all()
+    assert (found["reason"] == "")[(found["estimate"] <= model.worst) & found["in_domain"]].all()
+
+
+@settings(max_examples=8, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_a_place_has_the_same_bits_in_any_company(
+    model: Model, places: pd.DataFrame, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    some = rng.permutation(len(places))[: rng.integers(1, 30)]
+    whole = predict(model, places).iloc[some]
+    pd.testing.assert_frame_equal(predict(model, places.iloc[some]), whole, check_exact=True)
+
+
+def test_the_same_model_from_rows_in_any_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(training, "PAPER", Recipe(trees=5))
+    factors, labels = drives(4, {"a": 150, "b": 220})
+    mixed = factors.sample(frac=1.0, random_state=0), labels.sample(frac=1.0, random_state=1)
+    one, two = (
+        predict(train(join(f, {"drive": x}, COLUMNS), recipe="paper"), factors)
+        for f, x in ((factors, labels), mixed)
+    )
+    pd.testing.assert_frame_equal(one, two, check_exact=True)
+
+
+def test_a_factor_that_is_nan_gives_no_estimate(model: Model, places: pd.DataFrame) -> None:
+    holes = places.copy()
+    holes.loc[3, "score_H"] = np.nan
+    holes.loc[5, "FDOP"] = np.inf
+    holes.loc[5, "reason"] = "nothing in view"
+    found = predict(model, holes)
+    assert found["status"].value_counts().to_dict() == {"done": 198, "missing": 2}
+    estimates = [c.name for c in PREDICTION_COLUMNS if c.dtype == "float64"]
+    assert found.loc[[3, 5], estimates].isna().all(axis=None)
+    assert not found.loc[[3, 5], "in_domain"].any()
+    assert found.loc[3, "reason"] == "no estimate: score_H is not a number"
+    assert found.loc[5, "reason"] == "no estimate: FDOP is not a number: nothing in view"
+    whole = predict(model, places)
+    pd.testing.assert_frame_equal(found.drop(index=[3, 5]), whole.drop(index=[3, 5]))
+    nothing = predict(model, holes.loc[[3]])
+    assert nothing["status"].tolist() == ["missing"]
+    assert predict(model, places.iloc[:0]).empty
+
+
+def test_other_factors_than_it_was_trained_with_are_refused_by_name(
+    model: Model, places: pd.DataFrame
+) -> None:
+    with pytest.raises(ModelError, match="lacks factors that the model needs: FDOP, score_H"):
+        predict(model, places.drop(columns=["score_H", "FDOP"]))
+    with pytest.raises(ModelError, match="no numbers: FDOP"):
+        predict(model, places.assign(FDOP="near"))
+    with pytest.raises(ModelError, match="sensor does not match: the model was trained with VLP16"):
+        predict(model, places, made_with(COLUMNS, HDL64, 2.0))
+    with pytest.raises(ModelError, match=r"cell_size does not match: .* 2\.0, .* 1\.0"):
+        predict(model, places, made_with(COLUMNS, VLP16, 1.0))
+    units = {**MADE_WITH, "units": {**MADE_WITH["units"], "FDOP": "1/m"}}
+    with pytest.raises(ModelError, match="FDOP is in '1/m' in the table and was in '1'"):
+        predict(model, places, units)
+    with pytest.raises(ModelError, match="cell_size does not match"):
+        predict(model, places, {k: v for k, v in MADE_WITH.items() if k != "cell_size"})
+
+
+def test_a_place_unlike_the_training_places_is_flagged(model: Model, learnt: Dataset) -> None:
+    inside = predict(model, learnt.rows)
+    assert inside["in_domain"].mean() > 0.9
+    strange = learnt.rows.copy()
+    strange["bhatt_sim"] += 40.0
+    found = predict(model, strange)
+    assert not found["in_domain"].any()
+    assert found["reason"].str.contains("unlike the training places (bhatt_sim", regex=False).all()
+    # Each factor within its range, but together as never seen.
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(500, 1))
+    tied = np.hstack([x, x + 0.01 * rng.normal(size=(500, 1))])
+    domain = domain_of(tied, np.repeat([f"b{k}" for k in range(5)], 100))
+    assert domain.distance(np.array([[1.5, -1.5]]))[0] > domain.threshold
+    assert domain.distance(np.array([[1.5, 1.5]]))[0] < domain.threshold
+
+
+def test_a_constant_factor_is_part_of_the_domain() -> None:
+    X = np.column_stack([np.full(100, 16.0), np.arange(100.0)])
+    domain = domain_of(X, np.full(100, "b"))
+    assert (domain.distance(X) <= domain.threshold).mean() >= 0.99
+    assert domain.distance(np.array([[32.0, 50.0]]))[0] > domain.threshold
+
+
+def test_contributions_add_up_to_the_estimate(learnt: Dataset) -> None:
+    for log in (False, True):
+        forest = grow(learnt, "error_mean", Recipe(trees=7, leaf=3, log=log))
+        X = learnt.matrix()[:40]
+        roots = np.mean([t.tree_.value[0, 0, 0] for t in forest.trees.estimators_])
+        added = contributions(forest.trees, X)
+        assert np.allclose(added.sum(axis=1) + roots, forest.trees.predict(X), rtol=0, atol=1e-12)
+    unused = np.setdiff1d(
+        np.arange(X.shape[1]), np.concatenate([t.tree_.feature for t in forest.trees.estimators_])
+    )
+    assert (added[:, unused] == 0.0).all()
+
+
+def test_reasons_are_words_for_what_raises_the_estimate() -> None:
+    names = ["feature_count", "D1_count", "normal_H_8", "new_factor"]
+    X, typical = np.array([[100.0, 5.0, 1.0, 9.0]]), np.array([900.0, 50.0, 3.0, 2.0])
+    (words,) = in_words(np.array([[0.05, -0.01, 0.03, 0.001]]), X, typical, names)
+    assert words == (
+        "few features in view (feature_count 100, typically 900); "
+        "parallel walls, surfaces face few directions (normal_H_8 1, typically 3)"
+    )
+    (same,) = in_words(
+        np.array([[0.03, 0.02, 0.04, 0.0]]), X, typical, ["D3_count", "D3_ratio", *names[2:]]
+    )
+    assert same.startswith("bare surfaces without detail (D3_count")
+    assert in_words(np.array([[0.0, -1.0, 0.0, 0.0]]), X, typical, names) == [""]
+    assert phrase_of("new_factor", True) == "high new_factor"
+
+
+def test_every_factor_has_a_phrase() -> None:
+    assert {column.name for column in features_of(catalogue.COLUMNS)} == set(PHRASES)
+    assert set(NAMES) <= set(PHRASES)
+
+
+def test_a_model_is_one_file(model: Model, places: pd.DataFrame, tmp_path: Path) -> None:
+    path = tmp_path / "out" / "model.skops"
+    save_model(model, path)
+    again = load_model(path)
+    pd.testing.assert_frame_equal(predict(again, places), predict(model, places), check_exact=True)
+    assert again.factors == tuple(NAMES)
+    assert again.made_with == MADE_WITH
+    assert again.data_set == {"solver": "raw", "leaf": 2.0}
+    assert again.facts == model.facts
+    assert again.interval == model.interval
+    assert set(again.forests) == set(TARGETS)
+    assert [p.name for p in path.parent.iterdir()] == ["model.skops"]
+    with zipfile.ZipFile(path) as archive:
+        types = set(model_file._types(json.loads(archive.read("schema.json"))))
+    assert types == model_file.TYPES
+    assert skops.io.get_untrusted_types(file=path) == list(model_file.TRUSTED)
+
+
+def altered(path: Path, facts: dict[str, Any]) -> None:
+    """Write the model of `path` anew with other facts inside."""
+    content = skops.io.loads(path.read_bytes(), trusted=list(model_file.TRUSTED))
+    content["facts"] = json.dumps(json.loads(content["facts"]) | facts)
+    path.write_bytes(skops.io.dumps(content))
+
+
+@pytest.mark.parametrize(
+    ("facts", "message"),
+    [
+        ({"format_version": 0}, "of format 0, and this tilestream .* reads 1"),
+        ({"sklearn": "0.24.2"}, f"scikit-learn 0.24.2, here is {sklearn.__version__}"),
+        ({"format": "other"}, "no model of tilestream"),
+        ({"factors": ["one"]}, "its forest is not of its factors"),
+        ({"interval": None}, "a damaged model file"),
+    ],
+)
+def test_an_old_or_foreign_model_is_refused(
+    model: Model, tmp_path: Path, facts: dict[str, Any], message: str
+) -> None:
+    path = tmp_path / "model.skops"
+    save_model(model, path)
+    altered(path, facts)
+    with pytest.raises(ModelError, match=message):
+        load_model(path)
+
+
+class Harmful:
+    """Leaves a trace when it is built."""
+
+    built = False
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        type(self).built = True
+
+
+def test_other_types_are_refused_by_name_and_nothing_runs(tmp_path: Path) -> None:
+    path = tmp_path / "model.skops"
+    harmful = Harmful()
+    harmful.__dict__["x"] = 1
+    skops.io.dump({"facts": "{}", "forests": harmful}, path)
+    with pytest.raises(ModelError, match=r"types that no model of tilestream has: .*Harmful"):
+        load_model(path)
+    assert not Harmful.built
+    skops.io.dump({"facts": "{}", "forests": LinearRegression().fit([[1.0]], [1.0])}, path)
+    with pytest.raises(ModelError, match="LinearRegression"):
+        load_model(path)
+
+
+def test_files_that_are_no_models_are_refused(model: Model, tmp_path: Path) -> None:
+    with pytest.raises(SourceNotFoundError, match="no such model file"):
+        load_model(tmp_path / "absent.skops")
+    path = tmp_path / "model.skops"
+    save_model(model, path)
+    whole = path.read_bytes()
+    other = io.BytesIO()
+    with zipfile.ZipFile(other, "w") as archive:
+        archive.writestr("readme", "hello")
+    for content in (b"", b"\x80\x04K\x01.", whole[: len(whole) // 2], other.getvalue()):
+        path.write_bytes(content)
+        with pytest.raises(ModelError, match="no model file of tilestream"):
+            load_model(path)
+
+
+def test_a_tree_that_leads_out_of_its_arrays_is_refused(model: Model, tmp_path: Path) -> None:
+    for field, value in (("left_child", 10**6), ("left_child", 0), ("feature", 99)):
+        path = tmp_path / "model.skops"
+        save_model(model, path)
+        content = skops.io.loads(path.read_bytes(), trusted=list(model_file.TRUSTED))
+        tree = content["forests"]["error_mean"].estimators_[3].tree_
+        state = tree.__getstate__()
+        state["nodes"][field][0] = value
+        tree.__setstate__(state)
+        path.write_bytes(skops.io.dumps(content))
+        with pytest.raises(ModelError, match="a tree leads nowhere"):
+            load_model(path)
+
+
+def test_training_on_a_short_drive_says_that_nothing_was_calibrated(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(training, "PAPER", Recipe(trees=5))
+    short = train(dataset(0, lengths={"a": 80}), recipe="paper")
+    found = predict(short, drives(1, {"b": 50})[0])
+    assert short.interval.blocks == 0
+    assert found[["low", "high"]].isna().all(axis=None)
+    assert found["estimate"].notna().all()
+
+
+def test_bad_training_is_refused(learnt: Dataset) -> None:
+    with pytest.raises(UsageError, match="no recipe 'best': choose from default, paper"):
+        train(learnt, recipe="best")
+    with pytest.raises(ModelError, match="49 labelled points"):
+        train(learnt.take(np.arange(49)))
+
+
+def test_the_default_model_is_tuned_and_calibrated() -> None:
+    factors, labels = drives(9, {"a": 210, "b": 210}, related=0.9)
+    found = join(factors, {"drive": labels}, COLUMNS[:4])
+    made = train(found, n_jobs=1)
+    assert made.facts["recipe"] == "default"
+    assert made.facts["log"]
+    assert made.interval.blocks == 2
+    assert made.interval.level == pytest.approx(2 / 3)
+    assert made.interval.factor > 1.0
