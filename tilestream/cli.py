@@ -21,6 +21,7 @@ import typer
 import yaml
 from rich.box import SIMPLE
 from rich.console import Console
+from rich.logging import RichHandler
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -91,6 +92,9 @@ def root(
     ] = False,
 ) -> None:
     """The localization error of a LiDAR vehicle at every metre, from the map alone."""
+    plain = RichHandler(console=err, show_time=False, show_level=False, show_path=False)
+    logging.basicConfig(format="%(message)s", handlers=[plain])
+    logging.getLogger("tilestream").setLevel(logging.INFO)
     if version:
         out.print(VERSION, highlight=False)
         raise typer.Exit
