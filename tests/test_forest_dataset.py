@@ -250,6 +250,8 @@ def test_broken_tables_are_refused(short: tuple[pd.DataFrame, pd.DataFrame]) -> 
         join(factors, {"drive": labels.drop(columns="error_mean")}, COLUMNS)
     with pytest.raises(UsageError, match="none of the catalogue's factors"):
         join(factors[[*PLACE, "status", "reason"]], {"drive": labels}, COLUMNS)
+    with pytest.raises(UsageError, match="the factor table has no rows"):
+        join(factors.iloc[:0], {"drive": labels}, COLUMNS)
     with pytest.raises(UsageError, match="give positive lengths"):
         join(factors, {"drive": labels}, COLUMNS, tolerance=0.0)
 

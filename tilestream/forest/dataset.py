@@ -235,7 +235,7 @@ def join(
 
     Raises:
         UsageError: columns that a table lacks, a table with a row twice, a tolerance or block that
-            is not positive, no factor in the table.
+            is not positive, no rows or no factor in the factor table.
     """
     if not (tolerance > 0.0 and block > 0.0):
         raise UsageError(f"tolerance {tolerance!r} and block {block!r}: give positive lengths")
@@ -266,6 +266,8 @@ _NO_LABELS = pd.DataFrame({name: [] for name in _LABELLED})
 def _places(factors: pd.DataFrame, block: float) -> pd.DataFrame:
     """The sample points in one order, with path and block."""
     _require(factors, (*PLACE, "status", "reason"), "the factor table")
+    if factors.empty:
+        raise UsageError("the factor table has no rows: no sample points on this map?")
     twice = factors.duplicated(["route_id", "arc_length"])
     if twice.any():
         row = factors[twice].iloc[0]
