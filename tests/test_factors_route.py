@@ -1,0 +1,184 @@
+"""The factors job: the same tables from any tiling, workers and interruptions; bad places named."""
+
+import json
+from pathlib import Path
+
+import distributed
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+from scenes import PLACES
+
+import tilestream as ts
+from tilestream.cli import run
+from tilestream.errors import SourceError, UsageError
+from tilestream.formats.pcd import write_pcd
+from tilestream.formats.routes import route_of, write_geojson_route
+from tilestream.store import POINTS, Mark, Tile
+
+SENSOR = ts.VLP16.model_copy(update={"name": "short", "range_max": 25.0})
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A street of 60 m as a PCD file."""
+    path = tmp_path_factory.mktemp("street") / "street.pcd"
+    write_pcd(path, PLACES["canyon"](np.random.default_rng(3), 60.0, 0.3))
+    return path
+
+
+@pytest.fixture(scope="module")
+def store(street: Path) -> ts.TileStore:
+    return ts.ingest(street, street.parent / "map.zarr", tile_size=20.0)
+
+
+@pytest.fixture(scope="module")
+def route() -> ts.Route:
+    """Down the street, along no axis, out of the last tile by a few metres."""
+    points = np.array([[5.0, -1.0, np.nan], [30.0, 1.5, np.nan], [58.0, 0.0, np.nan]])
+    return route_of("down the street", points)
+
+
+@pytest.fixture(scope="module")
+def table(store: ts.TileStore, route: ts.Route, street: Path) -> pd.DataFrame:
+    return ts.factors_along(store, [route], street.parent / "out", spacing=3.0, sensor=SENSOR)
+
+
+def test_rows_follow_the_route_and_say_what_the_factors_of_their_places_are(
+    store: ts.TileStore, route: ts.Route, table: pd.DataFrame
+) -> None:
+    assert table["sample"].tolist() == list(range(len(table)))
+    np.testing.assert_allclose(np.diff(table["arc_length"]), 3.0)
+    points = ts.sample_points(route, store, spacing=3.0)
+    np.testing.assert_array_equal(table[["x", "y", "z"]], points.positions)
+    np.testing.assert_array_equal(table["heading"], points.heading)
+    assert (table["status"] == "done").all()
+    direct = ts.factors(store, points.positions, sensor=SENSOR, which="all")
+    pd.testing.assert_frame_equal(table[direct.columns.tolist()], direct, check_dtype=False)
+
+
+def test_sample_points_lie_a_sensor_height_above_the_ground(
+    store: ts.TileStore, route: ts.Route
+) -> None:
+    points = ts.sample_points(route, store, spacing=5.0, sensor_height=1.5).positions
+    cloud = np.concatenate([store.tile(key).points() for key in store.keys()])
+    for x, y, z in points:
+        near = (cloud[:, 0] - x) ** 2 + (cloud[:, 1] - y) ** 2 <= 1.0
+        assert z == pytest.approx(np.percentile(cloud[near, 2], 5.0) + 1.5, abs=1e-9)
+    with_z = route_of("z", np.array([[0.0, 0.0, 7.0], [10.0, 0.0, 8.0]]))
+    np.testing.assert_allclose(
+        ts.sample_points(with_z, store, spacing=5.0).positions[:, 2], [9.0, 9.5, 10.0], atol=0.02
+    )
+
+
+@pytest.mark.parametrize("tile_size", [10.0, 64.0])
+def test_no_tiling_and_no_number_of_workers_shows(
+    street: Path, route: ts.Route, table: pd.DataFrame, tmp_path: Path, tile_size: float
+) -> None:
+    other = ts.ingest(street, tmp_path / "map.zarr", tile_size=tile_size)
+    with (
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        found = ts.factors_along(
+            other, [route], tmp_path / "out", spacing=3.0, sensor=SENSOR, client=client
+        )
+    pd.testing.assert_frame_equal(found, table)
+
+
+def test_what_is_done_is_not_done_again_and_a_changed_map_is(
+    street: Path, route: ts.Route, tmp_path: Path
+) -> None:
+    store = ts.ingest(street, tmp_path / "map.zarr", tile_size=20.0)
+    results: list[object] = []
+
+    def work(**changes: object) -> pd.DataFrame:
+        results.clear()
+        watch = lambda outcome, *_: results.append(outcome.result)  # noqa: E731
+        how: dict[str, object] = {"spacing": 6.0, "sensor": SENSOR, "watch": watch} | changes
+        return ts.factors_along(store, [route], tmp_path / "out", **how)
+
+    first = work()
+    pd.testing.assert_frame_equal(work(), first)
+    assert {r for r in results if isinstance(r, int)} == {0}
+    (tmp_path / "out" / "factors" / "0_-1.parquet").unlink()
+    pd.testing.assert_frame_equal(work(), first)
+    there = (first["x"] < 20.0) & (first["y"] < 0.0)
+    assert sum(r for r in results if isinstance(r, int)) == there.sum() > 0
+    assert work(sensor_height=1.0)["z"].tolist() != first["z"].tolist()
+
+
+def test_every_column_is_documented_in_the_file(table: pd.DataFrame, street: Path) -> None:
+    (path, *_) = (street.parent / "out" / "factors").glob("*.parquet")
+    schema = pq.read_schema(path)
+    assert schema.names == table.columns.tolist()
+    for field in schema:
+        assert field.metadata[b"meaning"], field.name
+    data_set = json.loads(schema.metadata[b"tilestream"])["data_set"]
+    assert data_set["sensor"]["name"] == "short"
+    assert data_set["cell_size"] == 2.0
+
+
+def test_a_tile_that_failed_fails_those_who_see_it_and_no_others(
+    street: Path, tmp_path: Path
+) -> None:
+    store = ts.ingest(street, tmp_path / "map.zarr", tile_size=10.0)
+    Tile(store, ts.TileKey(5, 0)).write_reason(POINTS, Mark("failed", "disk on fire"))
+    line = route_of("line", np.array([[1.0, 0.5, 0.2], [51.0, 0.5, 0.2]]))
+    near = SENSOR.model_copy(update={"range_max": 12.0})
+    table = ts.factors_along(store, [line], tmp_path / "out", spacing=5.0, sensor=near)
+    failed = table["status"] == "failed"
+    assert table["reason"][failed].str.contains("tile 5_0 is failed: disk on fire").all()
+    # terms look 10 m beyond their tile: tile 4_0 cannot be had either, nor who sees it
+    assert failed.tolist() == [False] * 6 + [True] * 5
+    assert table.loc[failed, "feature_count"].isna().all()
+    assert (table.loc[~failed, "feature_count"] > 0).all()
+
+
+def test_places_without_map_are_rows_that_say_so(store: ts.TileStore, tmp_path: Path) -> None:
+    away = route_of("away", np.array([[50.0, 0.0, np.nan], [300.0, 0.0, np.nan]]))
+    table = ts.factors_along(store, [away], tmp_path / "out", spacing=50.0, sensor=SENSOR)
+    assert table["status"].tolist() == ["done"] + ["missing"] * 5
+    assert table["reason"][1:].str.contains("no ground").all()
+    assert (table["feature_count"][1:] == 0).all()
+    assert table["FDOP"][1:].isna().all()
+    high = ts.factors(store, [[30.0, 0.0, 500.0]], sensor=SENSOR)
+    assert high["status"].tolist() == ["missing"]
+    assert "vicinity is empty" in high["reason"][0]
+
+
+def test_routes_need_names_of_their_own(
+    store: ts.TileStore, route: ts.Route, tmp_path: Path
+) -> None:
+    for routes in ([], [route, route]):
+        with pytest.raises(UsageError, match="its own name"):
+            ts.factors_along(store, routes, tmp_path / "out")
+    with pytest.raises(UsageError, match="cell size of"):
+        ts.factors_along(store, [route], tmp_path / "out", cell_size=3.0)
+    (tmp_path / "tokyo.csv").write_text("x,y\n139.70,35.69\n139.71,35.70\n139.72,35.70\n")
+    with pytest.raises(SourceError, match="degrees"):
+        ts.read_routes(tmp_path / "tokyo.csv")
+
+
+def test_the_command(
+    store: ts.TileStore, route: ts.Route, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_geojson_route(tmp_path / "route.geojson", [route])
+    (tmp_path / "short.yaml").write_text(json.dumps(SENSOR.model_dump()))
+    command = ["factors", store.url, "--route", str(tmp_path / "route.geojson")]
+    command += ["--out", str(tmp_path / "out"), "--sensor", str(tmp_path / "short.yaml")]
+    assert run([*command, "--spacing", "6", "--dry-run"]) == 0
+    assert "terms" in capsys.readouterr().out
+    assert run([*command, "--spacing", "6", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"sample_points": 9, "done": 9}
+    assert run([*command, "--spacing", "6"]) == 0
+    assert "feature_count" in capsys.readouterr().out
+    assert run([*command, "--sensor", "VLP17"]) == 2
+    assert "known are VLP16, HDL64, OS1_128" in capsys.readouterr().err
+    far = route_of("far", np.array([[900.0, 0.0, np.nan], [990.0, 0.0, np.nan]]))
+    write_geojson_route(tmp_path / "route.geojson", [far])
+    assert run([*command, "--spacing", "60"]) == 1
+    assert "2 sample points: no ground" in capsys.readouterr().err
