@@ -133,7 +133,7 @@ def check_sums(sensor: Sensor, n: int, places: Floats) -> None:
             name = f"sight_{'xyz'[a]}{'xyz'[b]}"
             assert sums[name][p] == pytest.approx((u[:, a] * u[:, b]).sum(), abs=1e-8)
         field = terms["score"][inside].sum(axis=0)
-        steps = terms["score"][inside].max(axis=1, initial=0.0) / 2**15 + 1 / 2**12
+        steps = terms["score"][inside].max(axis=1, initial=0.0) / 2**31 + 1 / 2**20
         assert np.abs(sums["score"][p] - field).max() <= steps.sum()
         for name, bins in HISTOGRAMS.items():
             given = terms[name][inside]

@@ -24,8 +24,8 @@ Sums = dict[str, NDArray[Any]]
 
 FRACTION = 2.0**20
 """A term that is no whole number is summed in steps of 2^-20 of its unit."""
-FIELD_STEPS = 2.0**12
-"""The finest steps of a cell's 441 score sums: 2^-12; coarser where the largest needs 15 bits."""
+FIELD_STEPS = 2.0**20
+"""The finest steps of a cell's 441 score sums: 2^-20; coarser where the largest needs 31 bits."""
 HISTOGRAMS = {"normal_8": 8 * 8, "normal_16": 16 * 16, "normal_90": 90 * 90, "wall": 36}
 """Terms that are counted, not summed: the number of a bin, -1 for none; how many bins there are."""
 STANDING = "standing"
@@ -75,7 +75,7 @@ class TileTerms:
     """(n, 4) bins in the `HISTOGRAMS`."""
     standing: NDArray[np.bool_]
     """(n,) whether the cell's normal is not vertical."""
-    field: NDArray[np.int16]
+    field: NDArray[np.int32]
     """(n, 441) score sums in steps of 2^exponent / `FIELD_STEPS`, i slowest."""
     exponent: NDArray[np.uint8]
     """(n,) exponents of `field`."""
@@ -112,7 +112,7 @@ class TileTerms:
         loose_order = _by_block(loose_mean, CELL_BLOCK)
         values = np.asarray(terms[field], np.float64)[order]
         largest = values.max(axis=1, initial=0.0) * FIELD_STEPS
-        exponent = np.maximum(np.ceil(np.log2(np.maximum(largest, 1.0) / 2.0**15)), 0.0)
+        exponent = np.maximum(np.ceil(np.log2(np.maximum(largest, 1.0) / 2.0**31)), 0.0)
         columns = [fixed(term, name)[order] for name, term in summed.items()]
         return cls(
             names=tuple(summed),
@@ -122,8 +122,8 @@ class TileTerms:
             bins=np.column_stack([terms[name][order] for name in HISTOGRAMS]).astype(np.int16),
             standing=terms[STANDING][order].astype(np.bool_),
             field=np.minimum(
-                np.rint(values * (FIELD_STEPS / 2.0**exponent)[:, None]), 2**15 - 1
-            ).astype(np.int16),
+                np.rint(values * (FIELD_STEPS / 2.0**exponent)[:, None]), 2**31 - 1
+            ).astype(np.int32),
             exponent=exponent.astype(np.uint8),
             depth_mm=depth_mm[_by_group(depth_mm / MM_PER_M)],
             loose_mean=loose_mean[loose_order],

@@ -9,6 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from tilestream.kernels.azimuth import azimuth_bin_exactly, is_unsure, turns_guess
+from tilestream.kernels.vicinity import AT_PLACE
 
 COLUMNS = 360
 """Azimuth columns of the image, 1 deg each."""
@@ -141,7 +142,7 @@ def _directions(x, y, z, place, reach, sines, turns):  # type: ignore[no-untyped
         dx, dy, dz = x[i] - px, y[i] - py, z[i] - pz
         rr = dx * dx + dy * dy + dz * dz
         r = np.sqrt(rr)
-        sines[i] = dz / r if (rr > 0.0) & (r <= reach) else 2.0
+        sines[i] = dz / r if (r > AT_PLACE) & (r <= reach) else 2.0
         turns[i] = turns_guess(dx, dy)
 
 

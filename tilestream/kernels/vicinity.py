@@ -18,6 +18,10 @@ N_CELLS, RANGE, RANGE_SQUARED, UXX, UXY, UXZ, UYY, UYZ = range(8)
 """Columns of the sums that depend on the place: 1, r/R, (r/R)^2 and of u u^T, u = (mu - P)/r, all
 but u_z^2 = 1 - u_x^2 - u_y^2."""
 
+AT_PLACE = 1e-9
+"""What is no farther than this from a sample point [m] is at it: at coordinates of 4e6 m float64
+cannot say it better."""
+
 AZIMUTHS = 90
 """Bins of the azimuths of cells around a sample point."""
 
@@ -92,7 +96,7 @@ def _view_block(x, y, z, place, reach, low, high, inside, sector, view):  # type
         dx, dy, dz = x[i] - px, y[i] - py, z[i] - pz
         rr = dx * dx + dy * dy + dz * dz
         r = np.sqrt(rr)
-        member = (rr > 0.0) & (r <= reach) & (dz >= low * r) & (dz <= high * r)
+        member = (r > AT_PLACE) & (r <= reach) & (dz >= low * r) & (dz <= high * r)
         w = 1.0 if member else 0.0
         u = w * ONE / max(rr, 1e-300)
         count += np.int64(w)
@@ -127,9 +131,13 @@ def _enter_or_leave(c, sign, narrow, wide, exponent, bins, sums, wide_sums, coun
     """Add the terms of cell c to a sample point's sums, or take them away."""
     for j in range(narrow.shape[1]):
         sums[j] += sign * narrow[c, j]
-    factor = sign << np.int64(exponent[c])
-    for j in range(wide.shape[1]):
-        wide_sums[j] += factor * np.int64(wide[c, j])
+    shift = np.int64(exponent[c])
+    if sign > 0:
+        for j in range(wide.shape[1]):
+            wide_sums[j] += np.int64(wide[c, j]) << shift
+    else:
+        for j in range(wide.shape[1]):
+            wide_sums[j] -= np.int64(wide[c, j]) << shift
     for j in range(bins.shape[1]):
         counts[bins[c, j]] += np.int32(sign)
 
@@ -145,7 +153,7 @@ def add_cells(
     box: NDArray[np.float64],
     standing: NDArray[np.bool_],
     narrow: NDArray[np.int64],
-    wide: NDArray[np.int16],
+    wide: NDArray[np.int32],
     exponent: NDArray[np.uint8],
     bins: NDArray[np.int16],
     out_view: NDArray[np.int64],
@@ -258,6 +266,6 @@ def add_weights(
                 dx, dy, dz = xyz[0, i] - px, xyz[1, i] - py, xyz[2, i] - pz
                 rr = dx * dx + dy * dy + dz * dz
                 r = np.sqrt(rr)
-                member = (rr > 0.0) & (r <= reach) & (dz >= low * r) & (dz <= high * r)
+                member = (r > AT_PLACE) & (r <= reach) & (dz >= low * r) & (dz <= high * r)
                 total += weight[i] if member else np.int64(0)
         out[p] += total
