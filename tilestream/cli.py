@@ -5,6 +5,7 @@ Exit codes: 0 all good; 1 some sources, tiles or scans failed and are listed, th
 """
 
 import json
+import logging
 import math
 import sys
 from collections.abc import Iterator
