@@ -4,6 +4,9 @@ This is the judge of the fast code, so it shares nothing with it: plain NumPy an
 from the definitions alone (map, cells, points; sample point and vicinity; the 20 factors). Lengths
 are metres, angles radians, entropies bits.
 
+Where a distance is compared ("within r", "0 <"), 1e-9 m count as nothing, as in the bins, so that
+rounding decides nothing on regular maps either.
+
 Everything runs near the origin: the map is first moved by a whole number of lattice steps, which
 the definitions cannot see, so that coordinates of 4e6 m cost no digits.
 """
@@ -279,7 +282,7 @@ def in_view(place: Floats, targets: Floats, sensor: Sensor) -> Ints:
     """
     rays = targets - place
     distance = np.linalg.norm(rays, axis=1)
-    near = np.flatnonzero((distance > TIE) & (distance <= sensor.range_max))
+    near = np.flatnonzero((distance > TIE) & (distance <= sensor.range_max + TIE))
     low, high = np.radians(sensor.fov_deg)
     up = elevation(rays[near])
     return near[(low <= up) & (up <= high)]
@@ -369,7 +372,7 @@ def nearest_cells(world: World, x: Floats, limit: float = math.inf) -> tuple[Flo
     nearest[tied] = np.where(level, rivals, len(world.cells)).min(axis=1)
     far = np.vstack([world.cells.mean, np.full(3, np.inf)])
     length = np.linalg.norm(x - far[nearest], axis=1)
-    outside = length > limit
+    outside = length > limit + TIE
     return np.where(outside, np.inf, length), np.where(outside, len(world.cells), nearest)
 
 
@@ -446,7 +449,7 @@ def score_H(view: View) -> float:
 
 def neighbours(cells: LiteralCells, c: int) -> Ints:
     """Numbers of the other cells whose means lie within 5.0 m."""
-    near = np.linalg.norm(cells.mean - cells.mean[c], axis=1) <= NEIGHBOUR_RADIUS
+    near = np.linalg.norm(cells.mean - cells.mean[c], axis=1) <= NEIGHBOUR_RADIUS + TIE
     near[c] = False
     return np.flatnonzero(near)
 

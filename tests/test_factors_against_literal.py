@@ -6,7 +6,7 @@ owes its tolerance to arithmetic in single precision.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -75,7 +75,7 @@ CASES = (
     Case("park", 17, cell_size=3.0, offset=UTM, leaf=0.6),
     Case("empty_lot", 18, sensor=UNEVEN, tile_size=4.0),
     Case("regular", 19, tile_size=10.0),
-    Case("regular", 20, offset=UTM, leaf=0.3),
+    Case("regular", 20, cell_size=1.0, offset=UTM, leaf=0.2),
 )
 
 
@@ -105,11 +105,11 @@ def same(name: str, ours: float, literally: float) -> bool:
     return ours == pytest.approx(literally, rel=limit, abs=0.1 * limit, nan_ok=True)
 
 
-def check(case: Case, folder: Path) -> None:
+def check(case: Case, folder: Path, places: Sequence[int] = range(5)) -> None:
     points = scene(case.place, case.seed, size=16.0, offset=case.offset)
     store = store_of(folder, points, case.tile_size, case.leaf)
     mapped = literal_thinned(points, case.leaf)
-    positions = places_of_interest(mapped, case.cell_size, case.offset)
+    positions = places_of_interest(mapped, case.cell_size, case.offset)[list(places)]
     table = ts.factors(store, positions, sensor=case.sensor, cell_size=case.cell_size, which="all")
     world = world_of(mapped, case.cell_size)
     found, seen = [], 0
@@ -121,12 +121,12 @@ def check(case: Case, folder: Path) -> None:
             if not same(name, ours, value):
                 found.append(f"row {row} {name}: {ours!r}, literally {value!r}")
     assert found == []
-    assert seen > 100
+    assert seen > 50
 
 
 @pytest.mark.parametrize("case", CASES, ids=str)
 def test_factors_agree(case: Case, tmp_path: Path) -> None:
-    check(case, tmp_path)
+    check(case, tmp_path, places=(0, 1 + case.seed % 4))
 
 
 @pytest.mark.slow

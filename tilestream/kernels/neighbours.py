@@ -4,6 +4,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+WITHIN = 1e-9
+"""Distances that exceed a radius by no more than this are within it [m]: on regular maps rounding
+would choose."""
+
 
 def _keys(
     index: NDArray[np.int64], reach: tuple[int, int, int]
@@ -85,7 +89,7 @@ def neighbours_within(
         index: (m, 3) voxel indices, lexicographically sorted, without repeats.
         mean: (m, 3) means [m], each in its voxel; any common origin.
         cell_size: edge of a voxel [m].
-        radius: r [m], inclusive.
+        radius: r [m], inclusive: a distance of r counts though rounding adds up to 1e-9 m.
 
     Returns:
         (m + 1,) starts and (k,) neighbours: those of cell i are `near[start[i]:start[i + 1]]`,
@@ -93,7 +97,7 @@ def neighbours_within(
     """
     # Slightly more than the radius, for means that rounding put just outside of their voxels.
     reach = int(np.ceil(radius / cell_size + 1e-6))
-    return _lists(index, (reach, reach, reach), mean, radius, itself=False)
+    return _lists(index, (reach, reach, reach), mean, radius + WITHIN, itself=False)
 
 
 def cells_around(
