@@ -194,9 +194,11 @@ def _dilution(sums: Sums, kind: str) -> dict[str, Float64]:
     )
     minor_x, minor_y, minor_z = yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy
     determinant = xx * minor_x - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
-    # With trace 1, the least eigenvalue lies within a factor 2 of determinant / sum of minors.
+    # The trace is 1, so the sum of minors is about the middle eigenvalue times the largest, and the
+    # determinant over it about the least.
+    minors = minor_x + minor_y + minor_z
     with np.errstate(invalid="ignore", divide="ignore"):
-        spans = determinant > SINGULAR * (minor_x + minor_y + minor_z)
+        spans = (minors > SINGULAR) & (determinant > SINGULAR * minors)
         horizontal = np.sqrt((minor_x + minor_y) / np.where(spans, determinant, np.nan))
         vertical = np.sqrt(minor_z / np.where(spans, determinant, np.nan))
     return {f"{kind}_HDOP": horizontal, f"{kind}_VDOP": vertical}
