@@ -1,0 +1,110 @@
+"""Lay the routes of the simulated Shinjuku through its streets; writes the package's route file.
+
+    python benchmarks/shinjuku_routes.py
+
+The waypoints are ours; the ways between them keep clear of the real buildings.
+"""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+import tilestream
+from tilestream.simulation.footprints import read_footprints
+from tilestream.simulation.streets import Street, check_clear, clearance, free_space, route_between
+
+DATA = Path(tilestream.__file__).parent / "data"
+ROUTES = (
+    (
+        "I",
+        "narrow shopping streets, wide roads with hedges and trees, skyscrapers",
+        1163,
+        (
+            (-40, -85),
+            (-40, -12),
+            (2, -10),
+            (2, 62),
+            (-45, 62),
+            (-88, 100),
+            (-96, 148),
+            (-225, 135),
+            (-350, 112),
+        )
+        + ((-540, 84), (-590, 110), (-630, 280), (-668, 380), (-675, 500), (-680, 640)),
+    ),
+    (
+        "II",
+        "narrow road, wide pavements with bollards, lamp posts and trees, skyscrapers",
+        734,
+        ((-90, -170), (-92, -30), (-195, -22), (-212, 40), (-240, 150), (-262, 290))
+        + ((-340, 335), (-480, 312), (-560, 290)),
+    ),
+    (
+        "III",
+        "residential street, a tunnel at its beginning, trees all along the other side",
+        269,
+        ((-742, -290), (-766, -150), (-790, -50), (-830, 20)),
+    ),
+    (
+        "IV",
+        "narrow and dense shopping streets",
+        652,
+        ((600, 700), (585, 618), (512, 630), (482, 560), (450, 490), (390, 510), (393, 590))
+        + ((430, 598), (440, 650), (455, 672), (545, 624)),
+    ),
+    (
+        "V",
+        "narrow shopping street, multi-lane roads, skyscrapers, under several bridges",
+        794,
+        ((85, 680), (110, 600), (148, 475), (200, 462), (300, 465), (470, 412), (770, 320)),
+    ),
+    ("E1", "mapped only: shopping street", None, ((660, 160), (560, 225), (450, 285))),
+    ("E2", "mapped only: wide road", None, ((-220, 475), (-420, 560), (-620, 640))),
+)
+SPOTS = {
+    "I": [("narrow", 0, 200, "right"), ("furnished", 290, 420, "right")]
+    + [("crossing", 470, 530, "right"), ("bridge", 560, 586, "right")]
+    + [("tunnel", 640, 797, "right"), ("crossing", 850, 905, "right")]
+    + [("one-sided", 930, 1060, "left"), ("bridge", 1085, 1110, "right")],
+    "II": [("furnished", 0, 330, "right"), ("bridge", 250, 272, "right")]
+    + [
+        ("crossing", 385, 440, "right"),
+        ("one-sided", 470, 620, "left"),
+        ("bridge", 680, 700, "right"),
+    ],
+    "III": [("tunnel", 2, 156, "right"), ("one-sided", 156, 268, "right")],
+    "IV": [("narrow", 0, 651, "right")],
+    "V": [("narrow", 0, 200, "right"), ("bridge", 262, 284, "right"), ("bridge", 292, 318, "right")]
+    + [
+        ("crossing", 322, 372, "right"),
+        ("bridge", 440, 462, "right"),
+        ("bridge", 742, 770, "right"),
+    ]
+    + [("tunnel", 566, 726, "right"), ("wide", 372, 560, "right")],
+    "E1": [("narrow", 0, 100, "right")],
+    "E2": [("one-sided", 100, 240, "left"), ("bridge", 300, 330, "right")],
+}
+NAMES = ("kind", "begin", "end", "side")
+
+
+def main() -> None:
+    """Lay all routes, check their clearance exactly, and write them."""
+    buildings = read_footprints(DATA / "shinjuku_buildings.geojson.gz")
+    space = free_space(buildings)
+    features = []
+    for name, kind, points, waypoints in ROUTES:
+        xy = np.round(route_between(space, np.array(waypoints, np.float64), points), 3)
+        check_clear(Street(name, kind, xy, points is not None), buildings)
+        clear = clearance(xy, buildings)
+        print(f"{name}: {len(xy)} points, clearance {clear.min():.2f} to {clear.max():.1f} m")
+        spots = [dict(zip(NAMES, spot, strict=True)) for spot in SPOTS[name]]
+        properties = {"name": name, "kind": kind, "driven": points is not None, "spots": spots}
+        geometry = {"type": "LineString", "coordinates": xy.tolist()}
+        features.append({"type": "Feature", "properties": properties, "geometry": geometry})
+    document = {"type": "FeatureCollection", "name": "shinjuku routes", "features": features}
+    (DATA / "shinjuku_routes.geojson").write_text(json.dumps(document) + "\n")
+
+
+if __name__ == "__main__":
+    main()

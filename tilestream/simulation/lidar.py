@@ -1,0 +1,155 @@
+"""A spinning lidar: where its beams go, what comes back of them, and how that is measured."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tilestream.records import Float64, Scan
+from tilestream.sensors import Sensor
+from tilestream.simulation.mesh import REFLECTIVITY, Material
+from tilestream.simulation.settings import LidarSettings, stream
+
+LEAST_RANGE = 0.9
+"""Below this range nothing is measured: the vehicle itself [m]."""
+FADING = (0.6, 1.0)
+"""Shares of the largest range between which returns of dark surfaces fade."""
+GRAZING = np.cos(np.deg2rad(75.0))
+"""Cosine of incidence below which returns fade."""
+
+
+class Target(Protocol):
+    """What rays are cast at."""
+
+    def first_hits(
+        self, start: Float64, direction: Float64
+    ) -> tuple[Float64, Float64, NDArray[np.uint8]]:
+        """Range [m], cosine of incidence and material of each ray."""
+
+
+@dataclass(frozen=True, eq=False)
+class Turn:
+    """The rays of one turn of a sensor, in its own frame, in order of their firing."""
+
+    direction: Float64
+    """(n, 3) unit vectors in the lidar frame: x ahead, y left, z up."""
+    ring: NDArray[np.int32]
+    """(n,) beam, 0 the lowest."""
+    time: Float64
+    """(n,) firing time minus the middle of the turn [s]."""
+
+
+def turn_of(sensor: Sensor, first_azimuth: float = np.pi, blind_deg: float = 0.0) -> Turn:
+    """All rays of one turn, clockwise seen from above, without the blind sector to the rear.
+
+    Args:
+        sensor: the sensor.
+        first_azimuth: where the turn begins [rad, from x to y]; the cut is at the rear by default.
+        blind_deg: sector around the rear that gives nothing [deg].
+    """
+    firings = round(360.0 / sensor.azimuth_step_deg)
+    azimuth = first_azimuth - np.arange(firings) * (2 * np.pi / firings)
+    elevation = np.deg2rad(sensor.elevations_deg)
+    beams = len(elevation)
+    across, up = np.cos(elevation), np.sin(elevation)
+    direction = np.empty((firings, beams, 3))
+    direction[..., 0] = np.cos(azimuth)[:, None] * across
+    direction[..., 1] = np.sin(azimuth)[:, None] * across
+    direction[..., 2] = up
+    time = ((np.arange(firings) + 0.5) / firings - 0.5) / sensor.rate_hz
+    behind = np.abs(np.mod(azimuth, 2 * np.pi) - np.pi)
+    seen = behind >= np.deg2rad(blind_deg) / 2 if blind_deg > 0 else np.ones(firings, bool)
+    return Turn(
+        direction[seen].reshape(-1, 3),
+        np.tile(np.arange(beams, dtype=np.int32), int(seen.sum())),
+        np.repeat(time[seen], beams),
+    )
+
+
+def measure(
+    targets: tuple[Target, ...],
+    T_map_lidar: Float64,
+    velocity: Float64,
+    yaw_rate: float,
+    settings: LidarSettings,
+    stamp_ns: int,
+    seed: tuple[int, ...],
+) -> Scan:
+    """One scan, as the sensor would record it, from a vehicle that moves during the turn.
+
+    Each ray leaves from where the lidar is at its time; its point is recorded in the frame of that
+    time, not of the stamp (the middle of the turn): so a wall ahead is bent by the way of one turn.
+
+    Args:
+        targets: scenes of what stands and what moves; the nearest hit counts.
+        T_map_lidar: (4, 4) pose in the middle of the turn.
+        velocity: (3,) of the lidar in the map [m/s].
+        yaw_rate: turning of the vehicle [rad/s].
+        settings: of the lidar.
+        stamp_ns: time of the middle of the turn [ns].
+        seed: what the noise of this scan is drawn from: seed, drive, path, number of the scan.
+    """
+    sensor = settings.model
+    rng = stream(seed[0], "scan noise", *seed[1:])
+    turn = turn_of(sensor, rng.uniform(-np.pi, np.pi), settings.blind_deg)
+    time = turn.time if settings.distortion else np.zeros(len(turn.time))
+    start = T_map_lidar[:3, 3] + time[:, None] * velocity
+    angle = time * yaw_rate
+    local = turn.direction
+    turned = np.column_stack(
+        [
+            np.cos(angle) * local[:, 0] - np.sin(angle) * local[:, 1],
+            np.sin(angle) * local[:, 0] + np.cos(angle) * local[:, 1],
+            local[:, 2],
+        ]
+    )
+    direction = turned @ T_map_lidar[:3, :3].T
+    true, cosine, material = nearest(targets, start, direction)
+    came = returned(rng, true, cosine, material, sensor.range_max, settings.glass_loss)
+    bias = stream(seed[0], "beam bias").normal(0.0, settings.beam_bias, len(sensor.elevations_deg))
+    measured = true[came] + rng.normal(0.0, sensor.range_noise, int(came.sum()))
+    measured += bias[turn.ring[came]]
+    if settings.quantum > 0:
+        measured = np.rint(measured / settings.quantum) * settings.quantum
+    light = REFLECTIVITY[material[came]] * (0.3 + 0.7 * cosine[came])
+    return Scan(
+        stamp_ns,
+        local[came] * measured[:, None],
+        T_map_lidar,
+        light.astype(np.float32),
+        turn.ring[came],
+        turn.time[came],
+        int((~came).sum()),
+    )
+
+
+def nearest(
+    targets: tuple[Target, ...], start: Float64, direction: Float64
+) -> tuple[Float64, Float64, NDArray[np.uint8]]:
+    """The nearest of the first hits in several scenes."""
+    found, cosine, material = targets[0].first_hits(start, direction)
+    for target in targets[1:]:
+        other, its_cosine, its_material = target.first_hits(start, direction)
+        closer = other < found
+        found = np.where(closer, other, found)
+        cosine = np.where(closer, its_cosine, cosine)
+        material = np.where(closer, its_material, material)
+    return found, cosine, material
+
+
+def returned(
+    rng: np.random.Generator,
+    ranges: Float64,
+    cosine: Float64,
+    material: NDArray[np.uint8],
+    range_max: float,
+    glass_loss: float,
+) -> NDArray[np.bool_]:
+    """Which rays come back: within range, and by chance where far, grazing, or on glass."""
+    far = np.clip((ranges / range_max - FADING[0]) / (FADING[1] - FADING[0]), 0.0, 1.0)
+    far = np.where(np.isfinite(ranges), far, 1.0)
+    kept = (1.0 - 0.6 * far) * np.clip(cosine / GRAZING, 0.05, 1.0)
+    kept = np.where(material == Material.GLASS, kept * (1.0 - glass_loss), kept)
+    lucky = rng.uniform(size=len(ranges)) < kept
+    return lucky & (ranges >= LEAST_RANGE) & (ranges <= range_max)
