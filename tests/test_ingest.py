@@ -28,6 +28,7 @@ from tilestream.errors import (
     SourceNotFoundError,
     UsageError,
 )
+from tilestream.formats import open_source
 from tilestream.formats.las import write_las
 from tilestream.formats.pcd import write_pcd
 from tilestream.store import POINTS
@@ -120,6 +121,28 @@ def test_any_tile_and_block_size_stores_the_points_of_the_definition(
     expected = literal_thinning(cloud, round(leaf * 1000)) if leaf else as_set(mm)
     assert as_set(stored_points(store)) == expected
     assert not (url / "fragments").exists()
+
+
+@pytest.mark.parametrize("leaf", [0.05, 0.125, 0.333])
+def test_many_voxels_of_any_edge_sum_every_point_once(
+    tmp_path: Path, leaf: float
+) -> None:
+    cloud = np.random.default_rng(1).uniform(-4.0, 4.0, (60_000, 3))
+    write_pcd(tmp_path / "map.pcd", cloud.astype(np.float64))
+    tile_size = round(leaf * 200, 3)
+    store = ts.ingest(
+        tmp_path / "map.pcd", tmp_path / "map.zarr", tile_size=tile_size, map_leaf=leaf
+    )
+    assert as_set(stored_points(store)) == literal_thinning(
+        raw_points(tmp_path), round(leaf * 1000)
+    )
+
+
+def raw_points(folder: Path) -> np.ndarray:
+    """The points as the file holds them, which may have rounded them to float32."""
+    source = open_source(str(folder / "map.pcd"))
+    (span,) = source.spans(10**9)
+    return np.concatenate([block.points for block in source.blocks(span, 10**6)])
 
 
 def test_strips_change_nothing(
@@ -415,10 +438,12 @@ def test_real_scans_ingest_with_the_right_counts(
 
 
 MEMORY_PROBE = """
-import resource, sys
+import re, sys
+from pathlib import Path
 from tilestream.cli import run
 code = run(sys.argv[1:])
-print("PEAK", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+kilobytes = re.search(r"VmHWM:\\s+(\\d+) kB", Path("/proc/self/status").read_text())[1]
+print("PEAK", int(kilobytes) * 1024)
 sys.exit(code)
 """
 
