@@ -110,17 +110,16 @@ def _is_full(box, i, place, edges, guess, image):  # type: ignore[no-untyped-def
     lowest = z0 / np.sqrt((near if z0 < 0.0 else far) + z0 * z0)
     highest = z1 / np.sqrt((near if z1 > 0.0 else far) + z1 * z1)
     x, y = 0.5 * (x0 + x1), 0.5 * (y0 + y1)
-    left, right = 0.0, 0.0
-    for corner_x, corner_y in ((x0, y0), (x0, y1), (x1, y0), (x1, y1)):
-        slope = (x * corner_y - y * corner_x) / (x * corner_x + y * corner_y)
-        if not abs(slope) < 1.0:
-            return False
-        left, right = min(left, slope), max(right, slope)
-    # |slope| < 1 puts a corner within 45 deg of the middle, and an angle is less than its tangent.
+    half_x, half_y = 0.5 * (x1 - x0), 0.5 * (y1 - y0)
+    # No corner is farther from the middle's azimuth than the largest cross product over the
+    # smallest dot product with it; an angle is less than its tangent.
+    across = abs(x) * half_y + abs(y) * half_x
+    along = x * x + y * y - abs(x) * half_x - abs(y) * half_y
+    if across >= along:
+        return False
     middle = turns_guess(x, y) * COLUMNS
-    per_radian = COLUMNS / (2.0 * np.pi)
-    column_lo = np.int64(np.floor(middle + left * per_radian - 1e-2))
-    column_hi = np.int64(np.floor(middle + right * per_radian + 1e-2))
+    spread = across / along * (COLUMNS / (2.0 * np.pi)) + 1e-2
+    column_lo, column_hi = np.int64(np.floor(middle - spread)), np.int64(np.floor(middle + spread))
     row_lo = _row_of(lowest - MARGIN, edges, guess)
     row_hi = _row_of(highest + MARGIN, edges, guess)
     for row in range(row_lo, row_hi + 1):
