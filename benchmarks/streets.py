@@ -61,13 +61,12 @@ def long_street(tiles: int, seed: int, spacing: float) -> Iterator[Floats]:
         yield street_tile(seed, spacing, column)
 
 
+def section(place: str, seed: int, spacing: float, number: int = 0) -> Floats:
+    """A place of tests/scenes.py, 100 m long, as a section of the drive, centred on y = 50 m."""
+    points = PLACES[place](np.random.default_rng([seed, number]), SECTION, spacing)
+    return in_map(points, (number * SECTION, 50.0, 0.0))
+
+
 def drive(seed: int, spacing: float) -> Floats:
-    """A street along x through all the SECTIONS, centred on y = 50 m."""
-    parts = [
-        in_map(
-            PLACES[name](np.random.default_rng([seed, k]), SECTION, spacing),
-            (k * SECTION, 50.0, 0.0),
-        )
-        for k, name in enumerate(SECTIONS)
-    ]
-    return np.vstack(parts)
+    """A street along x through all the SECTIONS."""
+    return np.vstack([section(name, seed, spacing, k) for k, name in enumerate(SECTIONS)])
