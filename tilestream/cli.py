@@ -44,6 +44,8 @@ from tilestream.dataflow.localize_drive import plan_localize
 from tilestream.dataflow.localize_tasks import Reading
 from tilestream.dataflow.plan import Plan, megabytes
 from tilestream.dataflow.run import Watch, dask_client
+from tilestream.dataflow.simulate import SCENE_BYTES
+from tilestream.dataflow.simulate import simulate as simulate_city
 from tilestream.dataflow.tasks import Outcome
 from tilestream.errors import (
     PartialError,
@@ -60,6 +62,7 @@ from tilestream.formats.mcap import ScanSelection
 from tilestream.formats.routes import read_routes
 from tilestream.records import TruePose
 from tilestream.sensors import HDL64, OS1_128, VLP16, Sensor
+from tilestream.simulation.settings import load_preset
 from tilestream.store import POINTS, TileStore, open_store
 from tilestream.version import VERSION
 
@@ -495,6 +498,37 @@ def error_table(labels: pd.DataFrame) -> Table:
         place = f"worst: scan {row.scan} at {row.arc_length:.0f} m, ({row.x:.1f}, {row.y:.1f})"
         table.add_row(place, f"{row.error_mean:.4g} m")
     return table
+
+
+@app.command()
+def simulate(
+    city: Annotated[Literal["shinjuku"], typer.Argument(help="The city that ships with us.")],
+    folder: Annotated[str, typer.Option("--out", help="Folder of map, logs and routes.")],
+    preset: Annotated[
+        str, typer.Option(help="physical, paper, or your own YAML file.")
+    ] = "physical",
+    paths: Annotated[str | None, typer.Option(help="Only these, e.g. I,III; default: all.")] = None,
+    scans_per_point: Annotated[int, typer.Option(help="Turns of the lidar per metre.")] = 1,
+    seed: Annotated[int, typer.Option(help="Seed of everything.")] = 0,
+    drive: Annotated[int, typer.Option(min=0, help="Another day: other traffic and noise.")] = 0,
+    size: Annotated[Literal["full", "small"], typer.Option(help="small: 40 m per path.")] = "full",
+    scheduler: Annotated[str | None, SCHEDULER] = None,
+    workers: Annotated[int, WORKERS] = 1,
+) -> None:
+    """Simulate a survey of Shinjuku and drives through it; a killed run continues."""
+    settings = load_preset(preset).model_copy(update={"seed": seed, "drive": drive})
+    with dask_client(scheduler, workers, SCENE_BYTES) as client, progress() as watch:
+        made = simulate_city(
+            settings,
+            folder,
+            paths=paths.split(",") if paths else None,
+            scans_per_point=scans_per_point,
+            size=size,
+            client=client,
+            watch=watch,
+        )
+    out.print(f"{city}, preset {settings.preset}: {settings.note}", highlight=False)
+    out.print(f"The map is in {made}/survey, the drives are in {made}/logs", highlight=False)
 
 
 @app.command()

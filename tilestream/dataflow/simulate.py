@@ -22,7 +22,7 @@ from tilestream.records import Scan, Trajectory
 from tilestream.simulation.city import City, build_city, stretches
 from tilestream.simulation.drive import motion_of, odometry, scans, stamps_of
 from tilestream.simulation.settings import SimulationSettings
-from tilestream.simulation.streets import Street
+from tilestream.simulation.streets import Street, check_clear
 from tilestream.simulation.survey import survey
 
 SCENE_BYTES = 1_500_000_000
@@ -33,6 +33,8 @@ SMALL_POINTS, SMALL_RAYS = 40, 4_000
 """Of `size="small"`: sample points of each path, rays per metre of the survey."""
 BYTES_PER_RAY, BYTES_PER_SCAN = 4, 400_000
 """On disk, generously: of a survey, and of a scan while it waits for its log [bytes]."""
+POSE_NS = 50_000_000
+"""Between two poses of the odometry [ns]."""
 FIELDS = ("points", "intensity", "ring", "time_offset")
 """What a scan in a part file has."""
 
@@ -138,9 +140,11 @@ def simulate(
     if size == "small":
         thin = settings.survey.model_copy(update={"rays_per_m": SMALL_RAYS})
         settings = settings.model_copy(update={"survey": thin})
-    city = build_city(settings)
+    city = _city(settings.model_dump_json())
+    for street in city.streets:
+        check_clear(street, city.footprints)
     plan = plan_simulation(city, folder, paths, scans_per_point, size)
-    _require_space(plan, folder, settings)
+    require_space(folder, _bytes_needed(plan, settings))
     _begin(folder, city, plan)
     outcomes = execute(plan.tasks, client, watch)
     failures = {outcome.key: outcome.reason for outcome in outcomes if not outcome.ok}
@@ -202,14 +206,23 @@ def plan_simulation(
     return Plan((*tasks, *logs), BASE_BYTES + SCENE_BYTES).check()
 
 
-def _require_space(plan: Plan, folder: Path, settings: SimulationSettings) -> None:
-    """Refuse what would fill the disk half-way."""
+def _bytes_needed(plan: Plan, settings: SimulationSettings) -> int:
+    """What the files that are not there yet may take, generously [bytes]."""
     needed = 0
     for task in plan.tasks:
         if isinstance(task, SurveyTask) and not Path(task.path).exists():
             needed += task.work * settings.survey.rays_per_m * BYTES_PER_RAY
         elif isinstance(task, ScanTask) and not Path(task.path).exists():
             needed += 2 * task.work * task.scans_per_point * BYTES_PER_SCAN
+    return needed
+
+
+def require_space(folder: Path, needed: int) -> None:
+    """Refuse what would fill the disk half-way.
+
+    Raises:
+        PlanError: fewer than `needed` bytes are free where the folder is.
+    """
     place = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
     free = shutil.disk_usage(place).free
     if needed > free:
@@ -227,7 +240,7 @@ def _begin(folder: Path, city: City, plan: Plan) -> None:
     record = folder / "simulation.yaml"
     if record.exists() and yaml.safe_load(record.read_text())["settings"] != city_of:
         raise UsageError(
-            f"{folder} holds a simulation with other settings (see {record}): give another directory"
+            f"{folder} holds a simulation with other settings ({record}): give another directory"
         )
     facts = {
         "settings": city_of,
@@ -298,11 +311,14 @@ def _log(task: LogTask) -> int:
     stamps = stamps_of(motion, settings, task.scans_per_point)
     origin = round(stamps[0].mean())
     seen = stamps[: task.end].ravel()
-    poses = np.unique(np.concatenate([seen, np.arange(seen[0], seen[-1], 50_000_000)]))
-    arc = motion.arc_at((poses - origin) / 1e9)
-    truth = Trajectory(poses, motion.pose(city.ground, arc), "lidar")
+    every = np.arange(seen[0], seen[-1] + POSE_NS, POSE_NS)
+    # The truth has a pose at each scan besides: more than the odometry, so readers take it.
+    believed, truth = (
+        Trajectory(times, motion.pose(city.ground, motion.arc_at((times - origin) / 1e9)), "lidar")
+        for times in (every, np.unique(np.concatenate([seen, every])))
+    )
     part = Path(task.path).with_suffix(".part")
-    write_log(part, _parts(task), odometry(city, truth, street), truth=truth)
+    write_log(part, _parts(task), odometry(city, believed, street), truth=truth)
     part.replace(task.path)
     return len(seen)
 

@@ -57,7 +57,8 @@ def _style(
     footprints: Footprints, settings: SimulationSettings
 ) -> tuple[Float64, Float64, Float64]:
     """Depth of recesses [m], width of bays [m], share of pilasters: drawn by place, so that a
-    building looks the same whatever else is in the box that it is seen in."""
+    building looks the same whatever else is in the box that it is seen in.
+    """
     first = np.searchsorted(footprints.building, np.arange(len(footprints.height)))
     corner = np.rint(footprints.start[first] * 100.0).astype(np.int64)
     keys = stream(settings.seed, "relief").integers(1, 2**31, 6)
@@ -100,5 +101,5 @@ def _bays(
         walls(b + inward, b, z, top, Material.WALL),
     ]
     corners = [np.column_stack([xy, top]) for xy in (a, b, b + inward, a + inward)]
-    parts.append(quads(*corners, Material.WALL))
+    parts.append(quads(corners[0], corners[1], corners[2], corners[3], Material.WALL))
     return joined(parts)

@@ -43,7 +43,7 @@ class Motion:
         arc = np.interp(time, self.time, self.street.arc)
         before = np.minimum(time - self.time[0], 0.0) * self.speed[0]
         after = np.maximum(time - self.time[-1], 0.0) * self.speed[-1]
-        return arc + before + after
+        return np.asarray(arc + before + after)
 
     def pose(self, ground: Ground, arc: Float64) -> Float64:
         """(k, 4, 4) poses of the sensor in the map, level across, pitched with the road."""
@@ -112,18 +112,13 @@ def scans(
             step = motion.pose(city.ground, np.concatenate([arc - 0.05, arc, arc + 0.05]))
             speed = float(np.interp(arc[0], street.arc, motion.speed))
             velocity = (step[2, :3, 3] - step[0, :3, 3]) / 0.1 * speed
-            turned = np.angle(np.exp(1j * np.diff(street.heading(arc[0] + [-0.05, 0.05]))))[0]
+            heading = street.heading(arc[0] + np.array([-0.05, 0.05]))
+            turned = float(np.angle(np.exp(1j * (heading[1] - heading[0]))))
             moving = Scene(traffic.mesh(city.ground, arc[0], since), still.origin)
             seed = (settings.seed, settings.drive, _number(street), point * 64 + turn)
-            yield measure(
-                (still, moving),
-                step[1],
-                velocity,
-                turned / 0.1 * speed,
-                settings.lidar,
-                stamp,
-                seed,
-            )
+            yaw_rate = turned / 0.1 * speed
+            targets = (still, moving)
+            yield measure(targets, step[1], velocity, yaw_rate, settings.lidar, stamp, seed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +127,7 @@ class Traffic:
 
     street: Street
     cars: Float64
-    """(n, 4) arc length at time 0 [m], speed along the route [m/s], offset to its left [m], look."""
+    """(n, 4) arc length at time 0 [m], speed along the route [m/s], offset to the left [m], look."""
     people: Float64
     """(n, 4) likewise."""
 
@@ -187,7 +182,8 @@ def odometry(city: City, truth: Trajectory, street: Street) -> Trajectory:
 
 def smooth(rng: np.random.Generator, arc: Float64, size: float, axes: int = 2) -> Float64:
     """(k, axes) smooth curves over arc length, waves of 50 to 200 m, root mean square `size` in
-    all axes together [m]."""
+    all axes together [m].
+    """
     length = rng.uniform(50.0, 200.0, (4, axes))
     phase = rng.uniform(0.0, 2 * np.pi, (4, axes))
     waves = np.sin(arc[:, None, None] * 2 * np.pi / length + phase).sum(axis=1)

@@ -112,8 +112,9 @@ def _polygons(
     for number, feature in enumerate(document["features"]):
         try:
             geometry = feature["geometry"]
-            kinds = {"Polygon": lambda c: [c], "MultiPolygon": lambda c: c}
-            for polygon in kinds.get(geometry["type"], lambda _: [])(geometry["coordinates"]):
+            kind, coordinates = geometry["type"], geometry["coordinates"]
+            polygons = {"Polygon": [coordinates], "MultiPolygon": coordinates}.get(kind, [])
+            for polygon in polygons:
                 rings = [np.array(ring, np.float64).reshape(len(ring), -1) for ring in polygon]
                 yield [ring[:, :2] for ring in rings], feature.get("properties") or {}
         except (KeyError, TypeError, ValueError) as error:

@@ -183,8 +183,8 @@ def _rail(foot: Float64, yaw: Float64, size: Float64) -> Mesh:
     return joined(
         [
             posts(foot, np.full(len(foot), 0.05), 0.8 + 0.05 * size, Material.METAL),
-            boxes(foot + [0.0, 0.0, 0.75], bar, yaw, Material.METAL),
-            boxes(foot + [0.0, 0.0, 0.4], bar, yaw, Material.METAL),
+            boxes(foot + np.array([0.0, 0.0, 0.75]), bar, yaw, Material.METAL),
+            boxes(foot + np.array([0.0, 0.0, 0.4]), bar, yaw, Material.METAL),
         ]
     )
 
@@ -222,14 +222,14 @@ def vegetation(
     for row, place, scale in zip(rows, foot, size, strict=True):
         rng = stream(settings.seed, "leaves", growth, int(row))
         reach = np.array([1.6, 1.6, 1.5]) * (0.8 + 0.6 * scale)
-        middle = place + [0.0, 0.0, 3.8 + 1.8 * scale]
+        middle = place + np.array([0.0, 0.0, 3.8 + 1.8 * scale])
         parts.append(leaves(rng, np.tile(middle, (220, 1)), np.tile(reach, (220, 1)), 0.22))
     rows = hedges.within(low, high)
     foot = np.column_stack([hedges.xy[rows], ground.at(hedges.xy[rows])])
     for row, place, yaw, scale in zip(rows, foot, hedges.yaw[rows], hedges.size[rows], strict=True):
         rng = stream(settings.seed, "hedge leaves", growth, int(row))
         along = np.linspace(-1.0, 1.0, 90)[:, None] * [np.cos(yaw), np.sin(yaw), 0.0]
-        middle = place + [0.0, 0.0, 0.5 + 0.15 * scale] + along
+        middle = place + np.array([0.0, 0.0, 0.5 + 0.15 * scale]) + along
         parts.append(leaves(rng, middle, np.tile([0.35, 0.35, 0.5 + 0.2 * scale], (90, 1)), 0.12))
     return joined(parts)
 

@@ -99,4 +99,4 @@ class Ground:
     def _patches(self, base: Float64, edge: float) -> Mesh:
         at = [base + np.array(c) * edge for c in ((0, 0), (1, 0), (1, 1), (0, 1))]
         ring = [np.column_stack([xy, self.at(xy)]) for xy in at]
-        return quads(*ring, Material.GROUND)
+        return quads(ring[0], ring[1], ring[2], ring[3], Material.GROUND)

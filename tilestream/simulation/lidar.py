@@ -152,4 +152,5 @@ def returned(
     kept = (1.0 - 0.6 * far) * np.clip(cosine / GRAZING, 0.05, 1.0)
     kept = np.where(material == Material.GLASS, kept * (1.0 - glass_loss), kept)
     lucky = rng.uniform(size=len(ranges)) < kept
-    return lucky & (ranges >= LEAST_RANGE) & (ranges <= range_max)
+    came: NDArray[np.bool_] = lucky & (ranges >= LEAST_RANGE) & (ranges <= range_max)
+    return came

@@ -102,7 +102,11 @@ def boxes(centre: Float64, size: Float64, yaw: Float64, material: int, floor: bo
         for i, j in ((0, 1), (1, 2), (2, 3), (3, 0))
     ]
     lids = [top, base] if floor else [top]
-    return joined([*sides, *(quads(*lid.transpose(1, 0, 2), material) for lid in lids)])
+    return joined([*sides, *(_lid(lid, material) for lid in lids)])
+
+
+def _lid(ring: Float64, material: int) -> Mesh:
+    return quads(ring[:, 0], ring[:, 1], ring[:, 2], ring[:, 3], material)
 
 
 def posts(foot: Float64, radius: Float64, height: Float64, material: int, sides: int = 6) -> Mesh:

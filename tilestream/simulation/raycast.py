@@ -1,5 +1,7 @@
 """First hits of rays on triangles: the one place that knows Open3D."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,7 +34,7 @@ class Scene:
         if len(mesh):
             corners = (mesh.corners - self.origin).astype(np.float32).reshape(-1, 3)
             rows = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
-            self._scene.add_triangles(open3d.core.Tensor(corners), open3d.core.Tensor(rows))
+            self._scene.add_triangles(_tensor(corners), _tensor(rows))
         self._empty = not len(mesh)
 
     def first_hits(
@@ -54,10 +56,14 @@ class Scene:
         rays = np.empty((n, 6), np.float32)
         rays[:, :3] = start - self.origin
         rays[:, 3:] = direction
-        hit = self._scene.cast_rays(open3d.core.Tensor(rays), nthreads=1)
+        hit = self._scene.cast_rays(_tensor(rays), nthreads=1)
         ranges = hit["t_hit"].numpy().astype(np.float64)
         normal = hit["primitive_normals"].numpy().astype(np.float64)
         cosine = np.minimum(np.abs((normal * direction).sum(axis=1)), 1.0)
         met = np.isfinite(ranges)
         triangle = np.where(met, hit["primitive_ids"].numpy(), 0).astype(np.int64)
         return ranges, np.where(met, cosine, 0.0), np.where(met, self._material[triangle], 0)
+
+
+def _tensor(array: Any) -> Any:
+    return open3d.core.Tensor.from_numpy(array)

@@ -1,5 +1,6 @@
 """Streets as the free space between buildings: clearance, routes through it, their frames."""
 
+import itertools
 import json
 import os
 from dataclasses import dataclass
@@ -134,11 +135,11 @@ def route_between(space: FreeSpace, waypoints: Float64, points: int | None = Non
     grid, pitch = space.distance, space.cell
     waypoints = np.array([_clearest(grid, pitch, space.origin, place) for place in waypoints])
     legs = [waypoints[:1]]
-    for a, b in zip(waypoints[:-1], waypoints[1:], strict=True):
+    for a, b in itertools.pairwise(waypoints):
         legs.append(_leg(grid, pitch, space.origin, a, b)[1:])
     line = np.concatenate(legs)
     line = ndimage.gaussian_filter1d(line, 5.0 / pitch, axis=0, mode="nearest")
-    slope = np.stack(np.gradient(np.asarray(grid, np.float64), pitch))
+    slope = [np.gradient(np.asarray(grid, np.float64), pitch, axis=axis) for axis in (0, 1)]
     for _ in range(40):
         where = (line - space.origin).T / pitch
         short = np.maximum(MIN_CLEARANCE + 0.8 - space.at(line), 0.0)
@@ -192,7 +193,9 @@ def _leg(
         shape=(window.size, window.size),
     ).tocsr()
     source, target = (int(number[tuple(np.clip(end - low, 0, high - low - 1))]) for end in ends)
-    _, before = csgraph.dijkstra(graph, False, source, return_predecessors=True)
+    _, before = csgraph.dijkstra(
+        graph, directed=False, indices=np.array(source), return_predecessors=True
+    )
     if source != target and before[target] < 0:
         raise UsageError(f"no way of {MIN_CLEARANCE} m clearance from {a} to {b}: move a waypoint")
     cells = [target]

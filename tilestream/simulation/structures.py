@@ -54,8 +54,7 @@ def _tube(street: Street, spot: Spot, ground: Ground) -> Mesh:
         _strip(np.column_stack([right, foot]), np.column_stack([right, roof])),
         _strip(np.column_stack([left, roof]), np.column_stack([right, roof])),
     ]
-    for end, sign in ((0, -1.0), (-1, 1.0)):
-        parts.append(_portal(left[end], right[end], across[end], foot[end], roof[end], sign))
+    parts += [_portal(left[end], right[end], across[end], foot[end], roof[end]) for end in (0, -1)]
     return joined(parts)
 
 
@@ -63,15 +62,14 @@ def _strip(a: Float64, b: Float64) -> Mesh:
     return quads(a[:-1], a[1:], b[1:], b[:-1], Material.CONCRETE)
 
 
-def _portal(
-    left: Float64, right: Float64, across: Float64, foot: float, roof: float, _sign: float
-) -> Mesh:
+def _portal(left: Float64, right: Float64, across: Float64, foot: float, roof: float) -> Mesh:
     """The face that is seen from outside: the deck's edge and a wing wall on each side."""
     outer_left, outer_right = left + across * FLARE, right - across * FLARE
 
     def face(a: Float64, b: Float64, low: float, high: float) -> Mesh:
         ring = [(*a, low), (*b, low), (*b, high), (*a, high)]
-        return quads(*(np.array([corner]) for corner in ring), Material.CONCRETE)
+        a3, b3, c3, d3 = (np.array([corner]) for corner in ring)
+        return quads(a3, b3, c3, d3, Material.CONCRETE)
 
     return joined(
         [

@@ -1,0 +1,114 @@
+"""Pictures of the simulated Shinjuku: district and paths, scans and map at its special spots.
+
+    python benchmarks/figures_simulation.py [--preset paper|physical]
+
+Writes benchmarks/figures/simulation_*.png (needs matplotlib).
+"""
+
+import argparse
+from pathlib import Path
+
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.collections import LineCollection
+
+from tilestream.simulation.city import City, build_city
+from tilestream.simulation.drive import scans
+from tilestream.simulation.settings import load_preset
+from tilestream.simulation.survey import survey
+
+mpl.use("Agg")
+FIGURES = Path(__file__).resolve().parent / "figures"
+PLACES = (
+    ("canyon: dense shopping street", "IV", 300),
+    ("wide crossing", "I", 500),
+    ("tunnel", "III", 79),
+    ("bridge", "V", 305),
+    ("one-sided street", "III", 220),
+)
+COLOURS = {
+    "tunnel": "black",
+    "crossing": "tab:orange",
+    "bridge": "tab:purple",
+    "one-sided": "tab:green",
+    "furnished": "tab:olive",
+    "narrow": "tab:red",
+    "wide": "tab:cyan",
+}
+
+
+def district(city: City) -> None:
+    """Map of the district with the paths coloured by what their stretches are."""
+    fig, ax = plt.subplots(figsize=(16, 9.5))
+    edges = np.stack([city.footprints.start, city.footprints.end], axis=1)
+    ax.add_collection(LineCollection(list(edges), colors="0.7", linewidths=0.4))
+    for street in city.streets:
+        ax.plot(*street.xy.T, color="tab:blue" if street.driven else "0.4", lw=2)
+        for spot in street.spots:
+            stretch = street.at(np.arange(spot.begin, spot.end + 0.5))
+            ax.plot(*stretch.T, color=COLOURS[spot.kind], lw=5, solid_capstyle="butt")
+        ax.annotate(
+            street.name,
+            street.xy[0],
+            xytext=(8, -12),
+            textcoords="offset points",
+            fontsize=14,
+            weight="bold",
+        )
+    for kind, colour in COLOURS.items():
+        ax.plot([], [], color=colour, lw=5, label=kind)
+    ax.plot([], [], color="tab:blue", lw=2, label="driven")
+    ax.plot([], [], color="0.4", lw=2, label="mapped only")
+    ax.legend(loc="lower right", fontsize=11)
+    ax.set(aspect="equal", xlabel="east [m]", ylabel="north [m]")
+    ax.set_title("Simulated Shinjuku on real footprints (Project PLATEAU, CC BY 4.0)")
+    fig.tight_layout()
+    fig.savefig(FIGURES / "simulation_district.png", dpi=70)
+    plt.close(fig)
+
+
+def spots(city: City) -> None:
+    """Panorama, bird's-eye view of a scan, and the map around it, at each kind of place."""
+    fig, axes = plt.subplots(
+        len(PLACES), 3, figsize=(19, 4.6 * len(PLACES)), width_ratios=(2.0, 1, 1)
+    )
+    for (title, name, point), (wide, above, mapped) in zip(PLACES, axes, strict=True):
+        street = city.street(name)
+        scan = next(iter(scans(city, street, (point, point + 1))))
+        assert scan.T_map_lidar is not None
+        assert scan.ring is not None
+        azimuth = np.rad2deg(np.arctan2(scan.points[:, 1], scan.points[:, 0]))
+        ranges = np.linalg.norm(scan.points, axis=1)
+        dots = wide.scatter(azimuth, scan.ring, c=np.log10(ranges), s=5, cmap="turbo", marker="s")
+        wide.set(xlim=(180, -180), xlabel="azimuth [deg], 0 ahead", ylabel="ring")
+        wide.set_title(f"{title}: path {name}, {point} m, {len(ranges)} returns")
+        fig.colorbar(dots, ax=wide, label="log10 range [m]")
+        x, y, z = scan.points.T
+        above.scatter(x, y, c=z, s=0.6, cmap="turbo")
+        above.set(xlim=(-60, 60), ylim=(-60, 60), aspect="equal", title="scan from above [m]")
+        cloud = survey(city, street, (max(point - 12, 0), point + 12), 0)
+        T = scan.T_map_lidar
+        local = (cloud - T[:3, 3]) @ T[:3, :3]
+        local = local[np.abs(local[:, :2]).max(axis=1) < 60][::3]
+        mapped.scatter(
+            local[:, 0], local[:, 1], c=local[:, 2], s=0.15, cmap="turbo", vmin=-3, vmax=12
+        )
+        mapped.set(xlim=(-60, 60), ylim=(-60, 60), aspect="equal", title="map of 24 m, one pass")
+    fig.tight_layout()
+    fig.savefig(FIGURES / "simulation_spots.png", dpi=55)
+    plt.close(fig)
+
+
+def main() -> None:
+    """Draw everything."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--preset", default="physical")
+    city = build_city(load_preset(parser.parse_args().preset), check=False)
+    FIGURES.mkdir(exist_ok=True)
+    district(city)
+    spots(city)
+
+
+if __name__ == "__main__":
+    main()
