@@ -127,7 +127,7 @@ class Traffic:
 
     street: Street
     cars: Float64
-    """(n, 4) arc length at time 0 [m], speed along the route [m/s], offset to the left [m], look."""
+    """(n, 4) arc length at time 0 [m], speed along the route [m/s], offset left of it [m], look."""
     people: Float64
     """(n, 4) likewise."""
 
