@@ -490,24 +490,34 @@ def literal_pfh(cells: LiteralCells, c: int) -> Floats | None:
     return histogram / histogram.sum()
 
 
+@cache
+def histograms_around(view: View) -> tuple[dict[int, Ints], dict[int, Floats | None]]:
+    """Neighbours of each cell of the vicinity, and the histograms of all of these cells."""
+    cells = view.world.cells
+    around = {c: neighbours(cells, c) for c in view.members.tolist()}
+    involved = set(around) | {k for near in around.values() for k in near.tolist()}
+    return around, {c: literal_pfh(cells, c) for c in involved}
+
+
 def pfh_sim_H(view: View) -> float:
-    histograms = [literal_pfh(view.world.cells, c) for c in view.members]
-    entropies = [entropy(h) for h in histograms if h is not None]
+    around, histograms = histograms_around(view)
+    entropies = [entropy(h) for c in around if (h := histograms[c]) is not None]
     return float(np.mean(entropies)) if entropies else math.nan
 
 
+def pfh_distances(view: View) -> list[float]:
+    """L1 distance of each cell of the vicinity and each neighbour, both having histograms."""
+    around, histograms = histograms_around(view)
+    return [
+        float(np.abs(a - b).sum())
+        for c, near in around.items()
+        for k in near.tolist()
+        if (a := histograms[c]) is not None and (b := histograms[k]) is not None
+    ]
+
+
 def pfh_sim_mnht(view: View) -> float:
-    cells = view.world.cells
-    around = {c: neighbours(cells, c) for c in view.members}
-    involved = set(around) | {k for near in around.values() for k in near}
-    histograms = {c: literal_pfh(cells, c) for c in involved}
-    total = 0.0
-    for c, near in around.items():
-        for k in near:
-            a, b = histograms[c], histograms[k]
-            if a is not None and b is not None:
-                total += float(np.abs(a - b).sum())
-    return total
+    return float(sum(pfh_distances(view)))
 
 
 def bhattacharyya(cells: LiteralCells, c: int, others: Ints) -> Floats:
@@ -713,10 +723,8 @@ def score_cov_yy(view: View) -> float:
 
 def pfh_mean(view: View) -> float:
     """pfh_sim_mnht per pair of neighbours that both have a histogram; no such pair: NaN."""
-    cells = view.world.cells
-    has = {c: literal_pfh(cells, c) is not None for c in range(len(cells))}
-    pairs = sum(has[c] and has[k] for c in view.members for k in neighbours(cells, c))
-    return pfh_sim_mnht(view) / pairs if pairs else math.nan
+    distances = pfh_distances(view)
+    return float(np.mean(distances)) if distances else math.nan
 
 
 def bhatt_mean(view: View) -> float:

@@ -69,11 +69,11 @@ class Case:
 
 CASES = (
     Case("canyon", 11),
-    Case("canyon", 12, cell_size=1.0, tile_size=7.0, offset=UTM),
+    Case("canyon", 12, cell_size=1.0, tile_size=7.0, offset=UTM, size=11.0),
     Case("diagonal", 13, sensor=ts.HDL64, tile_size=12.0, offset=UTM),
     Case("crossing", 14, sensor=ts.OS1_128, cell_size=3.0, tile_size=9.0),
     Case("tunnel", 15, sensor=UNEVEN, tile_size=8.0, offset=UTM),
-    Case("park", 16, cell_size=1.0, tile_size=20.0, sensor=ts.OS1_128),
+    Case("park", 16, cell_size=1.0, tile_size=20.0, sensor=ts.OS1_128, size=12.0),
     Case("park", 17, cell_size=3.0, offset=UTM, leaf=0.6),
     Case("empty_lot", 18, sensor=UNEVEN, tile_size=4.0),
     Case("regular", 19, tile_size=10.0),

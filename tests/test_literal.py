@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from literal import (
     FAITHFUL,
+    ROBUST,
     SHIFTS,
     LiteralCells,
     View,
@@ -48,7 +49,7 @@ BITS = {
 
 @pytest.fixture(scope="module", params=sorted(PLACES))
 def view(request: pytest.FixtureRequest) -> View:
-    return view_from(world_of(scene(request.param, seed=7), 2.0), EYE, VLP16)
+    return view_from(world_of(scene(request.param, seed=7, size=14.0), 2.0), EYE, VLP16)
 
 
 @pytest.fixture(scope="module")
@@ -238,7 +239,7 @@ def test_laws_of_the_factors_on_a_street(view: View) -> None:
     f = factors_of(view)
     cells = view.world.cells
     distance = np.linalg.norm(cells.mean[view.members] - view.place, axis=1)
-    assert f["feature_count"] == f["D1_count"] + f["D2_count"] + f["D3_count"] > 50
+    assert f["feature_count"] == f["D1_count"] + f["D2_count"] + f["D3_count"] > 20
     assert f["D1_ratio"] + f["D2_ratio"] + f["D3_ratio"] == pytest.approx(1.0)
     assert f["FDOP"] == pytest.approx(1.0 / math.sqrt((distance**2).mean()))
     assert f["r_average"] <= 1.0 / f["FDOP"]
@@ -253,8 +254,27 @@ def test_laws_of_the_factors_on_a_street(view: View) -> None:
     assert f["bhatt_sim"] > 0.0
 
 
+def test_laws_of_the_robust_factors_on_a_street(view: View) -> None:
+    f = factors_of(view, ROBUST)
+    assert f["D1_share"] + f["D2_share"] + f["D3_share"] == pytest.approx(1.0)
+    assert 0.0 <= f["loose_share"] < 0.5
+    assert f["sight_HDOP"] ** 2 + f["sight_VDOP"] ** 2 >= 9.0 - 1e-9  # trace C >= 9 / trace C^-1
+    assert f["normal_HDOP"] ** 2 + f["normal_VDOP"] ** 2 >= 9.0 - 1e-9
+    assert 0.0 <= f["wall_H"] <= math.log2(36)
+    assert 0.0 <= f["wall_minor"] <= f["wall_major"] <= len(view.members)
+    assert f["wall_balance"] == pytest.approx(f["wall_minor"] / f["wall_major"])
+    assert 0.0 <= f["weak_axis"] < math.pi
+    assert 0.0 <= f["empty_sector"] <= 2 * math.pi
+    assert 0.0 <= f["score_soft_H"] <= math.log2(441)
+    assert f["score_curvature_min"] <= f["score_curvature_max"]
+    assert f["score_peaks"] >= 0.0
+    assert f["score_cov_xy"] ** 2 <= f["score_cov_xx"] * f["score_cov_yy"] + 1e-12
+    assert 0.0 < f["pfh_mean"] < 2.0
+    assert f["bhatt_mean"] > 0.0
+
+
 def test_factors_do_not_know_the_order_of_points_nor_where_the_map_lies() -> None:
-    points = scene("diagonal", seed=4, size=14.0)
+    points = scene("diagonal", seed=4, size=10.0)
     here = literal_factors(points, EYE, VLP16, 2.0)
     far = literal_factors(in_map(points, UTM), EYE + UTM, VLP16, 2.0)
     mixed = literal_factors(np.random.default_rng(0).permutation(points), EYE, VLP16, 2.0)
@@ -264,7 +284,7 @@ def test_factors_do_not_know_the_order_of_points_nor_where_the_map_lies() -> Non
 
 @pytest.mark.parametrize("quarters", [1, 2])
 def test_a_turn_about_the_lattice_changes_only_what_has_a_direction(quarters: int) -> None:
-    points = scene("canyon", seed=6, size=14.0)
+    points = scene("canyon", seed=6, size=12.0)
     points = points[(np.rint(points * 1000) % 500 != 0).all(axis=1)]  # voxels are half-open
     before = literal_factors(points, EYE, VLP16, 2.0)
     P = rotated_scene(EYE[None], quarters)[0]
