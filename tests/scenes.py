@@ -181,7 +181,8 @@ def regular(rng: Rng, size: float, spacing: float) -> Floats:
 
 
 PLACES: dict[str, Callable[[Rng, float, float], Floats]] = {
-    place.__name__: place for place in (canyon, diagonal, crossing, tunnel, park, empty_lot, regular)
+    place.__name__: place
+    for place in (canyon, diagonal, crossing, tunnel, park, empty_lot, regular)
 }
 
 

@@ -124,9 +124,7 @@ def test_any_tile_and_block_size_stores_the_points_of_the_definition(
 
 
 @pytest.mark.parametrize("leaf", [0.05, 0.125, 0.333])
-def test_many_voxels_of_any_edge_sum_every_point_once(
-    tmp_path: Path, leaf: float
-) -> None:
+def test_many_voxels_of_any_edge_sum_every_point_once(tmp_path: Path, leaf: float) -> None:
     cloud = np.random.default_rng(1).uniform(-4.0, 4.0, (60_000, 3))
     write_pcd(tmp_path / "map.pcd", cloud.astype(np.float64))
     tile_size = round(leaf * 200, 3)

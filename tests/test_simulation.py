@@ -299,7 +299,7 @@ def test_every_path_keeps_clear_of_every_building() -> None:
 
 def test_presets_refuse_what_they_do_not_know(tmp_path: Path) -> None:
     assert load_preset("paper").preset == "paper"
-    assert "proves nothing" in load_preset("paper").note
+    assert "prove nothing" in load_preset("paper").note
     bad = tmp_path / "mine.yaml"
     bad.write_text("lidar:\n  ranje_max: 40\n")
     with pytest.raises(UsageError, match=r"mine\.yaml.*ranje_max.*range_max"):

@@ -68,7 +68,7 @@ def test_fractions_of_a_millimetre_are_refused(length: float) -> None:
 
 @pytest.mark.parametrize(("tile", "halo"), [(0.0, 1.0), (-1.0, 1.0), (10.0, -1.0), (2e6, 0.0)])
 def test_impossible_grids_are_refused(tile: float, halo: float) -> None:
-    with pytest.raises(UsageError, match="tile_size|halo"):
+    with pytest.raises(UsageError, match=r"tile_size|halo"):
         TileGrid.of(tile, halo)
 
 

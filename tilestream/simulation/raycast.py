@@ -10,13 +10,21 @@ from tilestream.kernels import cells as _numba_first  # noqa: F401  Open3D bring
 from tilestream.records import Float64
 from tilestream.simulation.mesh import Mesh
 
-try:
-    import open3d
-except ImportError as missing:  # pragma: no cover - depends on the machine
-    raise UsageError(
-        f"the simulation needs Open3D, which cannot be loaded: {missing}. Install open3d-cpu; on a "
-        "bare Debian also: apt-get install libgl1 libegl1 libx11-6 libusb-1.0-0"
-    ) from None
+
+def _open3d() -> Any:
+    """Open3D, loaded when the first scene is built: it takes seconds and 100 MB.
+
+    Raises:
+        UsageError: it cannot be loaded; says what is missing.
+    """
+    try:
+        import open3d  # noqa: PLC0415 - see the docstring
+    except ImportError as missing:
+        raise UsageError(
+            f"the simulation needs Open3D, which cannot be loaded: {missing}. Install open3d-cpu; "
+            "on a bare Debian also: apt-get install libgl1 libegl1 libx11-6 libusb-1.0-0"
+        ) from None
+    return open3d
 
 
 class Scene:
@@ -30,7 +38,7 @@ class Scene:
     def __init__(self, mesh: Mesh, origin: Float64) -> None:
         self.origin = np.asarray(origin, np.float64)
         self._material = mesh.material
-        self._scene = open3d.t.geometry.RaycastingScene()
+        self._scene = _open3d().t.geometry.RaycastingScene()
         if len(mesh):
             corners = (mesh.corners - self.origin).astype(np.float32).reshape(-1, 3)
             rows = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
@@ -66,4 +74,4 @@ class Scene:
 
 
 def _tensor(array: Any) -> Any:
-    return open3d.core.Tensor.from_numpy(array)
+    return _open3d().core.Tensor.from_numpy(array)
