@@ -572,7 +572,7 @@ def dilution(directions: Floats) -> tuple[float, float]:
     """sqrt(C_xx + C_yy) and sqrt(C_zz), C = (mean of d d^T)^-1; NaN: they do not span space."""
     spread = directions.T @ directions / len(directions)
     minors = (np.trace(spread) ** 2 - np.trace(spread @ spread)) / 2.0
-    if not np.linalg.det(spread) > 1e-6 * minors:
+    if not (minors > 1e-6 and np.linalg.det(spread) > 1e-6 * minors):
         return math.nan, math.nan
     C = np.linalg.inv(spread)
     return math.sqrt(C[0, 0] + C[1, 1]), math.sqrt(C[2, 2])

@@ -58,6 +58,8 @@ class Case:
     offset: tuple[float, float, float] = HERE
     leaf: float = 0.0
     size: float = 16.0
+    spacing: float = 0.4
+    least_cells: int = 20
 
     def __str__(self) -> str:
         at = "origin" if self.offset == HERE else "utm"
@@ -104,11 +106,13 @@ def same(name: str, ours: float, literally: float) -> bool:
         limit = max(limit, 2.0**-20 * literally**2)
     if name.startswith("score_") and name in ROBUST_NAMES:  # a softmax of sums in single precision
         limit = 1e-3
-    return ours == pytest.approx(literally, rel=limit, abs=0.1 * limit, nan_ok=True)
+    # A single point between two means that are level to 1e-7 m may bend the field of a few points.
+    least = 5e-3 if name.startswith("score_curvature") else 0.1 * limit
+    return ours == pytest.approx(literally, rel=limit, abs=least, nan_ok=True)
 
 
 def check(case: Case, folder: Path, places: Sequence[int] = range(5)) -> None:
-    points = scene(case.place, case.seed, case.size, offset=case.offset)
+    points = scene(case.place, case.seed, case.size, case.spacing, case.offset)
     store = store_of(folder, points, case.tile_size, case.leaf)
     mapped = literal_thinned(points, case.leaf)
     positions = places_of_interest(mapped, case.cell_size, case.offset)[list(places)]
@@ -123,7 +127,7 @@ def check(case: Case, folder: Path, places: Sequence[int] = range(5)) -> None:
             if not same(name, ours, value):
                 found.append(f"row {row} {name}: {ours!r}, literally {value!r}")
     assert found == []
-    assert seen > 20
+    assert seen >= case.least_cells
 
 
 @pytest.mark.parametrize("case", CASES, ids=str)
@@ -144,6 +148,9 @@ def test_factors_agree_on_many_scenes(seed: int, tmp_path: Path) -> None:
         tile_size=cell_size * int(rng.integers(3, 40)),
         offset=(HERE, UTM)[rng.integers(2)],
         leaf=float(rng.choice([0.0, cell_size / 4])),
+        size=16.0 if cell_size >= 1.0 else 8.0,
+        spacing=min(0.4, 0.4 * cell_size),
+        least_cells=1,
     )
     check(case, tmp_path)
 
