@@ -223,7 +223,8 @@ class World:
     cell_of_point: Ints
     """(n,) -1 for points in no cell."""
     depth_points: Floats
-    """The map points thinned to 0.5 m."""
+    """The map points thinned to 0.5 m: the float64 of the map frame, moved exactly, since on which
+    side of a pixel's edge a point lies is exact too."""
     means: cKDTree
 
 
@@ -241,7 +242,8 @@ def world_of(points: Floats, cell_size: float) -> World:
         points=points_mm / 1000.0,
         cells=cells,
         cell_of_point=cell_of_point,
-        depth_points=thinned_mm(points_mm, DEPTH_EDGE_MM) / 1000.0,
+        depth_points=(thinned_mm(points_mm, DEPTH_EDGE_MM) + origin_mm) / 1000.0
+        - origin_mm / 1000.0,
         means=cKDTree(cells.mean),
     )
 
