@@ -117,6 +117,19 @@ def test_a_lost_chunk_is_an_error_and_not_zeros(tmp_path: Path, cloud: np.ndarra
         tile.points()
 
 
+@pytest.mark.parametrize("column", ["count", "mean"])
+def test_no_lost_chunk_of_a_table_reads_as_numbers(
+    tmp_path: Path, cloud: np.ndarray, column: str
+) -> None:
+    made = make_store(tmp_path, cloud[:100], tile_size=100.0)
+    tile = made.tile(made.keys()[0])
+    tile.write_table("t", {"count": np.arange(3), "mean": np.ones((3, 3))}, Mark("done"))
+    chunk = "c/0" if column == "count" else "c/0/0"
+    (Path(made.url) / str(tile.key) / "t" / column / chunk).unlink()
+    with pytest.raises(StoreError, match=f"{column} has lost a chunk"):
+        tile.read_table("t")
+
+
 def test_tables_come_back_with_their_mark(tmp_path: Path, cloud: np.ndarray) -> None:
     made = make_store(tmp_path, cloud[:100], tile_size=100.0)
     tile = made.tile(made.keys()[0])

@@ -1,7 +1,7 @@
 """The commands: parse, call, print. The only place that exits.
 
 Exit codes: 0 all good; 1 some sources, tiles or scans failed and are listed, the rest is done;
-2 usage: nothing was done.
+2 usage, or a job that does not fit its memory or disk.
 """
 
 import json
@@ -427,7 +427,7 @@ def factors(
         out.print(f"The tables are in {folder}/factors", highlight=False)
     if counts.get("done", 0) < len(rows):
         bad = rows[rows["status"] != "done"].groupby("reason").size()
-        reasons = {f"{count} sample points": str(reason) for reason, count in bad.items()}
+        reasons = {str(reason): f"{count} sample points" for reason, count in bad.items()}
         raise PartialError(f"{store}: not every sample point has factors:", reasons)
 
 

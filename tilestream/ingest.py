@@ -107,6 +107,8 @@ def scatter(
     pieces: list[tuple[int, int, int, int]] = []
     prints: dict[TileKey, tuple[int, int]] = {}
     start = dropped = 0
+    if store.fs.exists(f"{path}.json"):
+        store.fs.rm(f"{path}.json")  # an old index must not vouch for new points
     with store.fs.open(f"{path}.bin", "wb") as file:
         for block in open_source(source, **options).blocks(span, block_points):
             dropped += block.dropped

@@ -85,15 +85,6 @@ class Box:
             self.y_hi + margin_mm,
         )
 
-    def clamped(self, other: "Box") -> "Box":
-        """The part of the box that lies in `other` (empty: lo >= hi)."""
-        return Box(
-            max(self.x_lo, other.x_lo),
-            max(self.y_lo, other.y_lo),
-            min(self.x_hi, other.x_hi),
-            min(self.y_hi, other.y_hi),
-        )
-
 
 @dataclass(frozen=True)
 class TileGrid:

@@ -18,7 +18,7 @@ from tilestream.formats.routes import resample
 from tilestream.records import Route
 from tilestream.sensors import VLP16, Sensor
 from tilestream.store import TileStore, hash_of
-from tilestream.tables import read_tables
+from tilestream.tables import read_tables, remove_others
 from tilestream.tiling import TileKey, whole_mm
 
 SENSOR_HEIGHT = 2.0
@@ -44,7 +44,8 @@ def factors_along(
     Args:
         store: the map.
         routes: where; in the map's frame, each with a name of its own.
-        out: folder of the tables, `factors/<tile>.parquet`, a local path or any fsspec URL.
+        out: folder of the tables, `factors/<tile>.parquet`, a local path or any fsspec URL; tables
+            of an earlier, other job there are removed.
         spacing: distance between sample points [m].
         sensor: what looks.
         sensor_height: height of the lidar above the route, or above the ground where the route
@@ -67,6 +68,7 @@ def factors_along(
     routes = list(routes)
     looking = Looking(sensor, cell_size, which, sensor_height)
     plan = plan_factors(store, routes, out, spacing, looking, memory)
+    remove_others([task.out for task in plan.tasks if isinstance(task, FactorsTask)])
     outcomes = execute(plan.tasks, client, watch)
     failures = {o.key: o.reason for o in outcomes if not o.ok and o.stage == "factors"}
     if failures:
