@@ -150,7 +150,8 @@ def progress() -> Iterator[Watch]:
             bar.update(rows[outcome.stage], completed=ended, total=total)
             if not outcome.ok:
                 bar.console.print(f"[red]failed[/] {outcome.key}: ", end="")
-                bar.console.print(outcome.reason, markup=False, highlight=False)
+                told = outcome.details if "--debug" in sys.argv else outcome.reason
+                bar.console.print(told or outcome.reason, markup=False, highlight=False)
 
         yield watch
 
