@@ -338,6 +338,11 @@ class TileStore:
         keys = sorted(self._tile_folders())
         return dict(zip(keys, self._marks([(key, table) for key in keys]), strict=True))
 
+    def identities(self) -> dict[TileKey, str]:
+        """The identity of the points of each tile that is done: what tables are made from."""
+        marks = self.marks()
+        return {key: mark.identity for key, mark in marks.items() if mark.status == "done"}
+
     def _tile_folders(self) -> Iterable[TileKey]:
         for entry in self.fs.ls(self.root, detail=False):
             try:

@@ -1,7 +1,7 @@
 """The job that looks at the map: routes in, the factors of every sample point out."""
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -86,8 +86,12 @@ def plan_factors(
     spacing: float,
     looking: Looking,
     memory: int,
+    have: Mapping[TileKey, str] | None = None,
 ) -> Plan:
-    """What `factors_along` will run; arguments and errors as there."""
+    """What `factors_along` will run; arguments and errors as there.
+
+    `have` is the identity of the points of each tile of the map; None: as the store has them.
+    """
     names = tuple(route.route_id for route in routes)
     if not names or len(set(names)) < len(names):
         raise UsageError(
@@ -95,7 +99,7 @@ def plan_factors(
         )
     cell_mm = whole_mm(looking.cell_size, "cell_size")
     store.grid.require_cell_size(cell_mm)
-    have = {key: mark.identity for key, mark in store.marks().items() if mark.status == "done"}
+    have = store.identities() if have is None else have
     cells: dict[TileKey, Task] = {}
     terms: dict[TileKey, Task] = {}
     inputs: dict[TileKey, str] = {}
@@ -111,7 +115,7 @@ def plan_factors(
                 cells |= {k: CellsTask(store.url, k, cell_mm) for k in around if k not in cells}
                 needs = tuple(cells[k].key for k in around)
                 terms[key] = TermsTask(store.url, key, cell_mm, needs=needs)
-                inputs[key] = terms_inputs(store, key, cell_mm)
+                inputs[key] = terms_inputs(store, key, cell_mm, have)
         tasks.append(
             FactorsTask(
                 store.url,

@@ -27,6 +27,7 @@ from tilestream.formats.base import SourceInfo, Span
 from tilestream.formats.mcap import ScanSelection
 from tilestream.ingest import Fragment
 from tilestream.store import POINTS, Mark, StoreSettings, Tile, TileStore, hash_of, open_store
+from tilestream.tiling import TileKey
 
 POINTS_PER_TASK = 4_000_000
 """Points of a source that one scatter task reads: seconds of work, not milliseconds."""
@@ -101,21 +102,87 @@ def ingest(
         PartialError: some sources or tiles failed; the message lists them with reasons, and
             the rest is done and can be opened.
     """
-    settings = IngestSettings(tile_size=tile_size, halo=halo, map_leaf=map_leaf, crs=crs)
+    read = read_sources(
+        sources,
+        url,
+        IngestSettings(tile_size=tile_size, halo=halo, map_leaf=map_leaf, crs=crs),
+        client=client,
+        memory=memory,
+        watch=watch,
+        points_topic=points_topic,
+        pose_topic=pose_topic,
+        scans=scans,
+    )
+    failures = read.close(execute(read.merges.tasks, client, watch))
+    if failures:
+        raise PartialError(
+            f"{read.store.url}: {len(failures)} sources or tiles failed, the rest is done:",
+            failures,
+        )
+    return read.store
+
+
+@dataclass(frozen=True)
+class SourcesRead:
+    """A map whose sources have been read, and what is left to do: to write its tiles."""
+
+    store: TileStore
+    """Where the tiles go."""
+    found: Sequence[Source]
+    """The sources, with their counts or reasons."""
+    merges: Plan
+    """The tasks that write tiles; none where the store is current."""
+
+    @property
+    def identities(self) -> dict[TileKey, str]:
+        """The identity that the points of each tile have, or will have."""
+        tasks = [task for task in self.merges.tasks if isinstance(task, MergeTask)]
+        return {t.tile: t.mark.identity for t in tasks} if tasks else self.store.identities()
+
+    def close(self, outcomes: Sequence[Outcome]) -> dict[str, str]:
+        """Record what was made; what failed, with its reason.
+
+        Raises:
+            SourceError: the sources hold no points.
+        """
+        if not self.merges.tasks and self.store.identities():
+            return {}
+        _close(self.store, self.found, self.merges, outcomes)
+        failures = {source.path: source.reason for source in self.found if source.reason}
+        failures |= {outcome.key: outcome.reason for outcome in outcomes if not outcome.ok}
+        if not outcomes and not failures:
+            sources = ", ".join(source.path for source in self.found)
+            raise SourceError(f"{self.store.url}: the sources hold no points: {sources}")
+        return failures
+
+
+def read_sources(
+    sources: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+    url: str | os.PathLike[str],
+    settings: IngestSettings,
+    *,
+    client: Any | None,
+    memory: int,
+    watch: Watch | None,
+    points_topic: str | None = None,
+    pose_topic: str | None = None,
+    scans: ScanSelection | None = None,
+) -> SourcesRead:
+    """The first half of `ingest`: read all sources, plan the tiles. Arguments and errors as there.
+
+    The tasks that write the tiles may then run together with those that need them.
+    """
     found = _examine_all(sources, _log_options(points_topic, pose_topic, scans))
     store = _create_or_resume(str(url), _with_crs(settings, found), found)
     if _is_current(store, found):
-        return store
+        return SourcesRead(store, found, Plan((), memory))
     scatters = _plan_reading(store, found, memory)
     found, fragments = _sort_out(found, scatters, execute(scatters.tasks, client, watch))
     merges = plan_merge(
         store.url, fragments, store.settings.tile_size, store.settings.map_leaf, memory
     )
     _drop_tiles_without_points(store, merges)
-    outcomes = execute(merges.tasks, client, watch)
-    _close(store, found, merges, outcomes)
-    _raise_failures(store, found, outcomes)
-    return store
+    return SourcesRead(store, found, merges)
 
 
 def plan_ingest(
@@ -323,16 +390,3 @@ def _close(
             for source in found
         ]
     )
-
-
-def _raise_failures(store: TileStore, found: Sequence[Source], outcomes: Sequence[Outcome]) -> None:
-    failures = {source.path: source.reason for source in found if source.reason}
-    failures |= {outcome.key: outcome.reason for outcome in outcomes if not outcome.ok}
-    if failures:
-        raise PartialError(
-            f"{store.url}: {len(failures)} sources or tiles failed, the rest is done:", failures
-        )
-    if not outcomes:
-        raise SourceError(
-            f"{store.url}: the sources hold no points: {', '.join(s.path for s in found)}"
-        )

@@ -1,7 +1,7 @@
 """The job that measures: a log and a map in, the localization error of every sample point out."""
 
 import os
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -123,8 +123,14 @@ def plan_localize(
     scans: ScanSelection,
     starts_per_task: int | None,
     memory: int,
+    group: str = "",
+    have: Mapping[TileKey, str] | None = None,
 ) -> Plan:
-    """What `localize` will run; arguments and errors as there."""
+    """What `localize` will run; arguments and errors as there.
+
+    Where a job has several logs, `group` names this one's labels: part of their keys and paths.
+    `have` is the identity of the points of each tile of the map; None: as the store has them.
+    """
     reading = replace(reading, path=str(Path(reading.path).absolute()))
     log = reading.open()
     samples = choose_samples(log, scans, spacing)
@@ -132,7 +138,7 @@ def plan_localize(
     sizes = {cell_size, FINE_CELL} if true_pose == "refined" else {cell_size}
     for size in sizes:
         store.grid.require_cell_size(whole_mm(size, "cell_size"))
-    have = {key: mark.identity for key, mark in store.marks().items() if mark.status == "done"}
+    have = store.identities() if have is None else have
     log_state = hash_of(file_state(reading.path), repr(reading), measuring.identity())
     reach = (reading.range_max or REACH) + MARGIN
     cells: dict[str, Task] = {}
@@ -153,6 +159,7 @@ def plan_localize(
             samples=part,
             batch=(0, len(start_poses(np.eye(4), starts))),
             out=os.fspath(out),
+            group=group,
             map_state=hash_of([(str(key), have[key]) for key in keys]),
             identity=log_state,
             needs=tuple(needed),
@@ -215,7 +222,7 @@ def _slice_tasks(whole: RegisterTask, starts_per_task: int | None) -> list[Task]
     size = whole.batch[1] if starts_per_task is None else starts_per_task
     if size < 1:
         raise UsageError(f"starts_per_task is {size}: give at least 1")
-    name = f"{whole.samples[0].scan:06d}"
+    name = "/".join(part for part in (whole.group, f"{whole.samples[0].scan:06d}") if part)
     registers = []
     for low in range(0, whole.batch[1], size):
         batch = (low, min(low + size, whole.batch[1]))
@@ -228,5 +235,6 @@ def _slice_tasks(whole: RegisterTask, starts_per_task: int | None) -> list[Task]
         f"{whole.out}/errors/{name}.parquet",
         hash_of([task.identity for task in registers]),
         tuple(task.key for task in registers),
+        whole.group,
     )
     return [*registers, label]

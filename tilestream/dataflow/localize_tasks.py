@@ -112,9 +112,13 @@ class CellsTask:
     tile: TileKey
     cell_mm: int
     promised_bytes: int = BASE_BYTES + CELLS_BYTES
-    needs: tuple[str, ...] = ()
     stage: str = "cells"
     work: int = 1
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """The tile's points, where the same plan makes them."""
+        return (f"merge-{self.tile}",)
 
     @property
     def key(self) -> str:
@@ -241,6 +245,8 @@ class RegisterTask:
     identity: str
     """Hash of everything that the rows depend on."""
     needs: tuple[str, ...]
+    group: str = ""
+    """Which drive, as whose sensor; empty where a job has one only."""
     promised_bytes: int = BASE_BYTES + REGISTER_BYTES
     stage: str = "register"
 
@@ -251,8 +257,8 @@ class RegisterTask:
 
     @property
     def key(self) -> str:
-        """`register-<first sample>-<first start>`."""
-        return f"register-{self.samples[0].number}-{self.batch[0]}"
+        """`register-<group>-<first sample>-<first start>`."""
+        return "-".join(_named("register", self.group, self.samples[0].number, self.batch[0]))
 
 
 @dataclass(frozen=True)
@@ -265,6 +271,7 @@ class LabelTask:
     out: str
     identity: str
     needs: tuple[str, ...]
+    group: str = ""
     promised_bytes: int = BASE_BYTES
     stage: str = "label"
 
@@ -275,8 +282,12 @@ class LabelTask:
 
     @property
     def key(self) -> str:
-        """`label-<first sample>`."""
-        return f"label-{self.samples[0].number}"
+        """`label-<group>-<first sample>`."""
+        return "-".join(_named("label", self.group, self.samples[0].number))
+
+
+def _named(*parts: object) -> list[str]:
+    return [str(part) for part in parts if part != ""]
 
 
 @perform.register

@@ -4,6 +4,8 @@ A cell's neighbours are those of the whole map (definitions, section 2), so the 
 around the tile take part; what is kept is the tile's own.
 """
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from tilestream.factors.catalogue import CRITERIA
@@ -12,7 +14,7 @@ from tilestream.kernels.cells import cell_of_points, cell_sums, moments
 from tilestream.kernels.depth_image import thin
 from tilestream.ndt import MIN_POINTS
 from tilestream.records import Cells, Int64
-from tilestream.store import POINTS, Tile, TileStore, hash_of
+from tilestream.store import MISSING, POINTS, Tile, TileStore, hash_of
 from tilestream.tiling import Box, TileKey, whole_mm
 
 DEPTH_MM = 500
@@ -37,10 +39,21 @@ def reach_mm(cell_mm: int) -> int:
     return max(REACH_MM, 2 * cell_mm, SHIFT_MM + cell_mm)
 
 
-def terms_inputs(store: TileStore, key: TileKey, cell_mm: int) -> str:
-    """Hash of all that the terms of a tile are made from: the points of the tiles in reach."""
+def terms_inputs(
+    store: TileStore, key: TileKey, cell_mm: int, have: Mapping[TileKey, str] | None = None
+) -> str:
+    """Hash of all that the terms of a tile are made from: the points of the tiles in reach.
+
+    Args:
+        store: the map.
+        key: the tile.
+        cell_mm: edge of a cell [mm].
+        have: the identity of the points of each tile of the map; None: as the store has them.
+    """
     box = store.grid.core(key).grown(reach_mm(cell_mm))
     keys = list(store.grid.keys_over(box))
+    if have is not None:
+        return hash_of([(str(near), have.get(near, MISSING.identity)) for near in keys])
     return hash_of([(str(near), Tile(store, near).mark(POINTS).identity) for near in keys])
 
 
