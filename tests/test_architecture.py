@@ -36,8 +36,11 @@ KNOWN_ONLY_BY = {
 
 
 def step_in_dataflow(name: str) -> int:
-    """plan < tasks < run < the tasks of each job < the jobs."""
-    first = ("plan", "tasks", "run")
+    """plan < tasks < run < the tasks of each job < the jobs < the main job, over all of them."""
+    first = ("plan", "tasks", "run", "run_settings")
+    main = ("main_plan", "main_findings", "main_job")
+    if name in main:
+        return 5 + (name == "main_job")
     return first.index(name) if name in first else 3 if name.endswith("_tasks") else 4
 
 

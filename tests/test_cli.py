@@ -17,7 +17,7 @@ from scenes import PLACES, in_map
 from scipy.spatial.transform import Rotation
 
 import tilestream as ts
-from tilestream.cli import parse_bytes, run
+from tilestream.cli.commands import parse_bytes, run
 from tilestream.errors import UsageError
 from tilestream.formats.las import write_las
 from tilestream.formats.mcap import open_log

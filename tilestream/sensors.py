@@ -73,3 +73,6 @@ OS1_128 = Sensor(
     rate_hz=10.0,
 )
 """Ouster OS1-128: 128 beams, +-22.5 deg, 120 m, 1024 firings per turn at 10 Hz."""
+
+SENSORS = {sensor.name: sensor for sensor in (VLP16, HDL64, OS1_128)}
+"""The sensors that ship with tilestream, by name."""

@@ -114,6 +114,13 @@ class Dataset:
         """These rows only."""
         return replace(self, rows=self.rows.iloc[which].reset_index(drop=True))
 
+    def first_drives(self) -> "Dataset":
+        """Each place once, as the first of its groups by name has it: what models are judged on.
+
+        With a repeated drive a random split would put the same place on both sides.
+        """
+        return self.take(np.flatnonzero(~self.rows.duplicated(["path", "arc_length"])))
+
     def groups(self, names: Sequence[str]) -> "Dataset":
         """The rows of these groups only.
 

@@ -1,7 +1,7 @@
 """How good estimates are: Table IV and what stands beside it, on every protocol."""
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 
 import numpy as np
 import pandas as pd
@@ -139,17 +139,40 @@ def compare(
         ModelError: nothing can be learnt from the dataset.
     """
     dataset.check(target)
-    rows = []
+    judged = {name: judge(dataset, name, target, seed) for name in competitors}
+    return pd.concat([figures_by_protocol(found, name) for name, found in judged.items()])
+
+
+def judge(
+    dataset: Dataset, competitor: str, target: str = "error_mean", seed: int = 0
+) -> dict[str, pd.DataFrame | str]:
+    """What a competitor estimates for points that it has not seen, by the name of the protocol.
+
+    Returns:
+        The points of each protocol (`held_out`), or why it cannot be followed on this dataset.
+    """
+    found: dict[str, pd.DataFrame | str] = {}
     for protocol in PROTOCOLS:
         try:
             splits = protocol.splits(dataset, seed)
         except ModelError as error:
-            rows.append({"protocol": protocol.name, "reason": str(error)})
-            continue
-        for name in competitors:
-            found = figures_of(held_out(dataset, splits, name, target, seed))
-            rows.append({"protocol": protocol.name, "model": name, **asdict(found), "reason": ""})
-    return pd.DataFrame(rows)
+            found[protocol.name] = str(error)
+        else:
+            found[protocol.name] = held_out(dataset, splits, competitor, target, seed)
+    return found
+
+
+def figures_by_protocol(judged: Mapping[str, pd.DataFrame | str], model: str) -> pd.DataFrame:
+    """What `judge` found as figures: the rows of one model of `compare`."""
+    rows: list[dict[str, object]] = []
+    for protocol, points in judged.items():
+        row: dict[str, object] = {"protocol": protocol, "model": model}
+        if isinstance(points, str):
+            rows.append(row | {"reason": points})
+        else:
+            rows.append(row | asdict(figures_of(points)) | {"reason": ""})
+    names = ["protocol", "model", *(f.name for f in fields(Figures)), "reason"]
+    return pd.DataFrame(rows).reindex(columns=names)
 
 
 def table_iv(

@@ -6,35 +6,27 @@ Exit codes: 0 all good; 1 some sources, tiles or scans failed and are listed, th
 
 import json
 import logging
-import math
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict
 from importlib import resources
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import Annotated, Any, Literal
 
-import pandas as pd
-import rich.progress
 import typer
 import yaml
-from rich.box import SIMPLE
 from rich.console import Console
 from rich.logging import RichHandler
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    TaskID,
-    TextColumn,
-    TimeRemainingColumn,
-)
-from rich.table import Table
-from rich.text import Text
 
+from tilestream.cli.progress import err, progress
+from tilestream.cli.tables import (
+    error_facts,
+    error_table,
+    factor_table,
+    info_table,
+    plan_table,
+    tile_table,
+)
 from tilestream.config import IngestSettings, RegistrationSettings, StartSettings
 from tilestream.dataflow import ingest_map
 from tilestream.dataflow.factors_route import factors_along, plan_factors
@@ -42,11 +34,9 @@ from tilestream.dataflow.factors_tasks import Looking
 from tilestream.dataflow.localize_drive import localize as localize_drive
 from tilestream.dataflow.localize_drive import plan_localize
 from tilestream.dataflow.localize_tasks import Reading
-from tilestream.dataflow.plan import Plan, megabytes
-from tilestream.dataflow.run import Watch, dask_client
+from tilestream.dataflow.run import dask_client
 from tilestream.dataflow.simulate import SCENE_BYTES
 from tilestream.dataflow.simulate import simulate as simulate_city
-from tilestream.dataflow.tasks import Outcome
 from tilestream.errors import (
     PartialError,
     PlanError,
@@ -55,13 +45,12 @@ from tilestream.errors import (
     TilestreamError,
     UsageError,
 )
-from tilestream.factors.catalogue import COLUMNS, Which
+from tilestream.factors.catalogue import Which
 from tilestream.formats import describe
-from tilestream.formats.base import SourceInfo
 from tilestream.formats.mcap import ScanSelection
 from tilestream.formats.routes import read_routes
 from tilestream.records import TruePose
-from tilestream.sensors import HDL64, OS1_128, VLP16, Sensor
+from tilestream.sensors import SENSORS, Sensor
 from tilestream.simulation.settings import load_preset
 from tilestream.store import POINTS, TileStore, open_store
 from tilestream.version import VERSION
@@ -73,9 +62,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 out = Console()
-err = Console(stderr=True)
 
-SENSORS = {sensor.name: sensor for sensor in (VLP16, HDL64, OS1_128)}
 Matcher = Literal["default", "autoware"]
 SCHEDULER = typer.Option(help="Run on this Dask scheduler, e.g. tcp://10.0.0.1:8786.")
 WORKERS = typer.Option(min=1, help="Worker processes on this machine; 1: this process.")
@@ -120,67 +107,6 @@ def parse_bytes(text: str) -> int:
             if amount > 0:
                 return amount
     raise UsageError(f"{text!r} is no amount of memory: give a form like 512MB or 2GB")
-
-
-class Rate(ProgressColumn):
-    """How much of a stage ends per second."""
-
-    def render(self, task: rich.progress.Task) -> Text:
-        """The rate, empty before the first task has ended."""
-        rate = task.finished_speed or task.speed
-        return Text(f"{rate:,.1f}/s" if rate else "")
-
-
-@contextmanager
-def progress() -> Iterator[Watch]:
-    """A progress bar per stage on stderr; failures are printed as they happen."""
-    columns = (
-        TextColumn("{task.description:>8}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        Rate(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=err, transient=not err.is_terminal) as bar:
-        rows: dict[str, TaskID] = {}
-
-        def watch(outcome: Outcome, ended: int, total: int) -> None:
-            if outcome.stage not in rows:
-                rows[outcome.stage] = bar.add_task(outcome.stage, total=total)
-            bar.update(rows[outcome.stage], completed=ended, total=total)
-            if not outcome.ok:
-                bar.console.print(f"[red]failed[/] {outcome.key}: ", end="")
-                told = outcome.details if "--debug" in sys.argv else outcome.reason
-                bar.console.print(told or outcome.reason, markup=False, highlight=False)
-
-        yield watch
-
-
-def tile_table(store: TileStore) -> Table:
-    """The tiles of a store with status, counts and extents."""
-    table = Table(title=str(store), title_justify="left", box=SIMPLE)
-    for column in ("tile", "status", "points", "read", "lowest [m]", "highest [m]", "reason"):
-        right = column in ("points", "read")
-        table.add_column(column, justify="right" if right else "left", no_wrap=column != "reason")
-    for key, mark in store.marks(POINTS).items():
-        facts = mark.facts
-        lowest, highest = (
-            " ".join(f"{value:z.1f}" for value in facts.get(end, ()))
-            for end in ("lowest", "highest")
-        )
-        points, read = (f"{facts[name]:,}" if name in facts else "" for name in ("points", "read"))
-        table.add_row(str(key), mark.status, points, read, lowest, highest, mark.reason)
-    return table
-
-
-def plan_table(plan: Plan) -> Table:
-    """The stages of a plan with their tasks and promised memory."""
-    table = Table(title="plan", title_justify="left", box=SIMPLE)
-    for column in ("stage", "tasks", "promised memory per task"):
-        table.add_column(column, justify="left" if column == "stage" else "right")
-    for stage, count, promise in plan.describe():
-        table.add_row(stage, str(count), megabytes(promise))
-    return table
 
 
 def print_sources(store: TileStore) -> None:
@@ -289,24 +215,6 @@ def info(
         print_json(asdict(found))
     else:
         out.print(info_table(found))
-
-
-def info_table(found: SourceInfo) -> Table:
-    """What is in a file, a line per fact."""
-    table = Table(show_header=False, title=found.path, title_justify="left", box=SIMPLE)
-    table.add_row("format", found.format)
-    table.add_row("size", f"{found.size_bytes:,} bytes")
-    table.add_row(
-        "points", "only reading it tells" if found.points is None else f"{found.points:,}"
-    )
-    if found.bounds:
-        for name, corner in zip(("lowest [m]", "highest [m]"), found.bounds, strict=True):
-            table.add_row(name, "  ".join(f"{value:.3f}" for value in corner))
-    table.add_row("fields", ", ".join(f"{name}: {kind}" for name, kind in found.fields))
-    table.add_row("CRS", found.crs or "none in the file")
-    for note in found.notes:
-        table.add_row("note", note)
-    return table
 
 
 @app.command()
@@ -447,58 +355,6 @@ def read_sensor(path: str) -> Sensor:
     if not isinstance(fields, dict):
         raise UsageError(f"{path}: give the fields of a sensor, e.g. range_max: 100.0")
     return Sensor(**fields)
-
-
-def factor_table(rows: pd.DataFrame) -> Table:
-    """The factors of a route: how they are spread."""
-    table = Table(title=f"factors of {len(rows)} sample points", title_justify="left", box=SIMPLE)
-    table.add_column("factor")
-    for name in ("unit", "lowest", "median", "highest"):
-        table.add_column(name, justify="right")
-    for column in COLUMNS:
-        if column.name in rows:
-            values = rows[column.name]
-            spread = (values.min(), values.median(), values.max())
-            table.add_row(column.name, column.unit, *(f"{value:.4g}" for value in spread))
-    for status, count in rows["status"].value_counts().items():
-        table.add_row(f"{status}: {count}", "", "", "", "")
-    return table
-
-
-THRESHOLDS = (0.10, 0.15, 0.20, 0.25)
-"""The paper's error thresholds [m] (its Table I)."""
-
-
-def error_facts(labels: pd.DataFrame) -> dict[str, float | None]:
-    """The errors of a drive in a few numbers: mean, median, tails [m], p_fail; None of nothing."""
-    done = labels[labels["status"] == "done"]
-    error = done["error_mean"]
-    facts = {
-        "sample_points": len(labels),
-        "failed": len(labels) - len(done),
-        "mean_m": float(error.mean()),
-        "median_m": float(error.median()),
-        "p95_m": float(error.quantile(0.95)),
-        "max_m": float(error.max()),
-        "p_fail": float(done["p_fail"].mean()),
-        "floor_m": float(done["error_floor"].mean()),
-        "tail_m": float(done["error_tail"].mean()),
-        **{f"share_over_{t:.2f}_m": float((error > t).mean()) for t in THRESHOLDS},
-    }
-    return {name: None if math.isnan(value) else value for name, value in facts.items()}
-
-
-def error_table(labels: pd.DataFrame) -> Table:
-    """The errors of a drive, and its worst places."""
-    table = Table(title="localization error", title_justify="left", box=SIMPLE)
-    table.add_column("fact")
-    table.add_column("value", justify="right")
-    for name, value in error_facts(labels).items():
-        table.add_row(name, f"{value:.4g}" if isinstance(value, float) else str(value))
-    for row in labels.nlargest(3, "error_mean").itertuples():
-        place = f"worst: scan {row.scan} at {row.arc_length:.0f} m, ({row.x:.1f}, {row.y:.1f})"
-        table.add_row(place, f"{row.error_mean:.4g} m")
-    return table
 
 
 @app.command()

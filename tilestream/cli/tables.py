@@ -1,0 +1,109 @@
+"""What the commands print: facts as tables for people, as plain values for machines."""
+
+import math
+
+import pandas as pd
+from rich.box import SIMPLE
+from rich.table import Table
+
+from tilestream.dataflow.plan import Plan, megabytes
+from tilestream.factors.catalogue import COLUMNS
+from tilestream.formats.base import SourceInfo
+from tilestream.store import POINTS, TileStore
+
+
+def tile_table(store: TileStore) -> Table:
+    """The tiles of a store with status, counts and extents."""
+    table = Table(title=str(store), title_justify="left", box=SIMPLE)
+    for column in ("tile", "status", "points", "read", "lowest [m]", "highest [m]", "reason"):
+        right = column in ("points", "read")
+        table.add_column(column, justify="right" if right else "left", no_wrap=column != "reason")
+    for key, mark in store.marks(POINTS).items():
+        facts = mark.facts
+        lowest, highest = (
+            " ".join(f"{value:z.1f}" for value in facts.get(end, ()))
+            for end in ("lowest", "highest")
+        )
+        points, read = (f"{facts[name]:,}" if name in facts else "" for name in ("points", "read"))
+        table.add_row(str(key), mark.status, points, read, lowest, highest, mark.reason)
+    return table
+
+
+def plan_table(plan: Plan) -> Table:
+    """The stages of a plan with their tasks and promised memory."""
+    table = Table(title="plan", title_justify="left", box=SIMPLE)
+    for column in ("stage", "tasks", "promised memory per task"):
+        table.add_column(column, justify="left" if column == "stage" else "right")
+    for stage, count, promise in plan.describe():
+        table.add_row(stage, str(count), megabytes(promise))
+    return table
+
+
+def info_table(found: SourceInfo) -> Table:
+    """What is in a file, a line per fact."""
+    table = Table(show_header=False, title=found.path, title_justify="left", box=SIMPLE)
+    table.add_row("format", found.format)
+    table.add_row("size", f"{found.size_bytes:,} bytes")
+    table.add_row(
+        "points", "only reading it tells" if found.points is None else f"{found.points:,}"
+    )
+    if found.bounds:
+        for name, corner in zip(("lowest [m]", "highest [m]"), found.bounds, strict=True):
+            table.add_row(name, "  ".join(f"{value:.3f}" for value in corner))
+    table.add_row("fields", ", ".join(f"{name}: {kind}" for name, kind in found.fields))
+    table.add_row("CRS", found.crs or "none in the file")
+    for note in found.notes:
+        table.add_row("note", note)
+    return table
+
+
+def factor_table(rows: pd.DataFrame) -> Table:
+    """The factors of a route: how they are spread."""
+    table = Table(title=f"factors of {len(rows)} sample points", title_justify="left", box=SIMPLE)
+    table.add_column("factor")
+    for name in ("unit", "lowest", "median", "highest"):
+        table.add_column(name, justify="right")
+    for column in COLUMNS:
+        if column.name in rows:
+            values = rows[column.name]
+            spread = (values.min(), values.median(), values.max())
+            table.add_row(column.name, column.unit, *(f"{value:.4g}" for value in spread))
+    for status, count in rows["status"].value_counts().items():
+        table.add_row(f"{status}: {count}", "", "", "", "")
+    return table
+
+
+THRESHOLDS = (0.10, 0.15, 0.20, 0.25)
+"""The paper's error thresholds [m] (its Table I)."""
+
+
+def error_facts(labels: pd.DataFrame) -> dict[str, float | None]:
+    """The errors of a drive in a few numbers: mean, median, tails [m], p_fail; None of nothing."""
+    done = labels[labels["status"] == "done"]
+    error = done["error_mean"]
+    facts = {
+        "sample_points": len(labels),
+        "failed": len(labels) - len(done),
+        "mean_m": float(error.mean()),
+        "median_m": float(error.median()),
+        "p95_m": float(error.quantile(0.95)),
+        "max_m": float(error.max()),
+        "p_fail": float(done["p_fail"].mean()),
+        "floor_m": float(done["error_floor"].mean()),
+        "tail_m": float(done["error_tail"].mean()),
+        **{f"share_over_{t:.2f}_m": float((error > t).mean()) for t in THRESHOLDS},
+    }
+    return {name: None if math.isnan(value) else value for name, value in facts.items()}
+
+
+def error_table(labels: pd.DataFrame) -> Table:
+    """The errors of a drive, and its worst places."""
+    table = Table(title="localization error", title_justify="left", box=SIMPLE)
+    table.add_column("fact")
+    table.add_column("value", justify="right")
+    for name, value in error_facts(labels).items():
+        table.add_row(name, f"{value:.4g}" if isinstance(value, float) else str(value))
+    for row in labels.nlargest(3, "error_mean").itertuples():
+        place = f"worst: scan {row.scan} at {row.arc_length:.0f} m, ({row.x:.1f}, {row.y:.1f})"
+        table.add_row(place, f"{row.error_mean:.4g} m")
+    return table

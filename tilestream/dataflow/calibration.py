@@ -1,0 +1,82 @@
+"""How long work takes here: what a plan costs before it runs, kept up to date by every run."""
+
+import json
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from tilestream.dataflow.plan import Task
+from tilestream.dataflow.tasks import Outcome
+
+SECONDS_PER_WORK: Mapping[str, float] = {
+    "survey": 0.05,
+    "scan": 0.1,
+    "log": 0.02,
+    "scatter": 1e-6,
+    "merge": 0.3,
+    "cells": 0.2,
+    "terms": 2.4,
+    "factors": 0.002,
+    "observe": 0.06,
+    "register": 0.4,
+    "label": 0.002,
+    "join": 2.0,
+    "judge": 20.0,
+    "weigh": 60.0,
+    "train": 30.0,
+    "predict": 0.001,
+}
+"""Before the first run: seconds per unit of work (tile, scan, sample point, …) of each stage, on
+the machine of benchmarks/RESULTS.md."""
+LEAST = 0.03
+"""Tasks that took less found their work done, or tell nothing [s]."""
+
+
+def calibration_file() -> Path:
+    """Where this user's figures are kept: `$XDG_CACHE_HOME` (or `~/.cache`) `/tilestream`."""
+    cache = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    return Path(cache) / "tilestream" / "seconds.json"
+
+
+def seconds_per_work() -> dict[str, float]:
+    """Seconds per unit of work of each stage, as far as known: measured here, or shipped."""
+    try:
+        known = json.loads(calibration_file().read_text())
+        measured = {str(stage): float(seconds) for stage, seconds in known.items()}
+    except (OSError, ValueError, AttributeError, TypeError):
+        measured = {}
+    return {**SECONDS_PER_WORK, **measured}
+
+
+def learn(tasks: Iterable[Task], outcomes: Iterable[Outcome]) -> None:
+    """Take the times of a run into the figures, half new and half old; a full disk is no error."""
+    work = {task.key: task.work for task in tasks}
+    seconds: dict[str, float] = {}
+    units: dict[str, int] = {}
+    for outcome in outcomes:
+        if outcome.ok and outcome.seconds >= LEAST and outcome.key in work:
+            seconds[outcome.stage] = seconds.get(outcome.stage, 0.0) + outcome.seconds
+            units[outcome.stage] = units.get(outcome.stage, 0) + work[outcome.key]
+    known = seconds_per_work()
+    for stage, count in units.items():
+        if count:
+            fresh = seconds[stage] / count
+            known[stage] = (known[stage] + fresh) / 2.0 if stage in known else fresh
+    place = calibration_file()
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        part = place.with_name(f"{place.name}.{os.getpid()}.part")
+        part.write_text(json.dumps(known, indent=2, sort_keys=True))
+        part.replace(place)
+    except OSError:
+        return
+
+
+def core_hours(tasks: Iterable[Task]) -> dict[str, float]:
+    """Estimated core-hours of each stage."""
+    known = seconds_per_work()
+    hours: dict[str, float] = {}
+    for task in tasks:
+        cost = task.work * known.get(task.stage, 1.0) / 3600.0
+        hours[task.stage] = hours.get(task.stage, 0.0) + cost
+    return hours

@@ -1,0 +1,170 @@
+"""What the main job found: the tables of a run directory, gathered for its report."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from tilestream.dataflow.estimate_tasks import JudgeTask, PredictTask, WeighTask, judged
+from tilestream.dataflow.localize_tasks import box_around
+from tilestream.dataflow.plan import Task
+from tilestream.errors import ModelError
+from tilestream.forest.dataset import Dataset
+from tilestream.forest.evaluation import ceiling, figures_by_protocol
+from tilestream.forest.intervals import coverage
+from tilestream.forest.training import PREDICTION_COLUMNS
+from tilestream.records import Float64
+from tilestream.report.findings import AROUND, Findings
+from tilestream.store import POINTS, Tile, TileStore
+from tilestream.tables import read_tables
+
+PLACE = ["route_id", "sample"]
+MAIN = "error_mean"
+
+
+@dataclass(frozen=True)
+class Done:
+    """The tasks of a run that are done, and where their tables are."""
+
+    factors: tuple[str, ...]
+    """Tables of factors."""
+    estimate: tuple[Task, ...]
+    """The tasks after measuring that are done."""
+    dataset: str | None
+    """The joined dataset; None: nothing was measured, or it could not be joined."""
+
+    def judgements(self) -> dict[tuple[str, str, str], dict[str, pd.DataFrame | str]]:
+        """What was judged, by (target, competitor, factor set; empty: all factors)."""
+        tasks = [task for task in self.estimate if isinstance(task, JudgeTask)]
+        return {(t.target, t.competitor, t.factor_set): judged(t.out) for t in tasks}
+
+
+def places_of(done: Done) -> pd.DataFrame:
+    """Every sample point with its factors and its estimate, or why it has none."""
+    factors = read_tables(done.factors).drop(columns=["status", "reason"])
+    tables = [task.out for task in done.estimate if isinstance(task, PredictTask)]
+    names = [column.name for column in PREDICTION_COLUMNS]
+    if tables:
+        found = read_tables(tables)[[*PLACE, *names]]
+    else:
+        found = pd.DataFrame(columns=[*PLACE, *names])
+    joined = factors.merge(found, on=PLACE, how="left", validate="one_to_one")
+    lost = joined["status"].isna()
+    joined["in_domain"] = joined["in_domain"].eq(True)
+    joined.loc[lost, "status"] = "failed"
+    joined.loc[lost, "reason"] = "no estimate: its task failed, see run.json"
+    dtypes = {c.name: c.dtype for c in PREDICTION_COLUMNS if c.dtype == "float64"}
+    return joined.astype(dtypes)
+
+
+def labels_of(
+    dataset: Dataset | None, places: pd.DataFrame, points: pd.DataFrame | None
+) -> pd.DataFrame:
+    """The measured places, with what a model said of them that had not seen them.
+
+    Args:
+        dataset: what was measured.
+        places: every sample point.
+        points: held-out points of the model that leaves paths out; None: the model in use was
+            trained elsewhere, so that its estimates are held out as they are.
+    """
+    if dataset is None:
+        return pd.DataFrame()
+    if points is None:
+        said = places.rename(columns={"route_id": "path", "estimate": "held_out"})
+    else:
+        said = points.rename(columns={"estimate": "held_out"})
+    said = said[["path", "arc_length", "held_out"]]
+    return dataset.rows.merge(said, on=["path", "arc_length"], how="left")
+
+
+def evaluation_of(
+    found: Mapping[tuple[str, str, str], Mapping[str, pd.DataFrame | str]],
+) -> dict[str, pd.DataFrame]:
+    """Judgements as tables: `protocols`, `table_iv`, `coverage`, and `parts` for other targets."""
+    rows = {key: figures_by_protocol(judgement, key[1]) for key, judgement in found.items()}
+    protocols = [
+        table for (target, _, chosen), table in rows.items() if (target, chosen) == (MAIN, "")
+    ]
+    sets = [
+        table.assign(factors=chosen or "all + robust")
+        for (target, model, chosen), table in rows.items()
+        if target == MAIN and (chosen or model in ("paper", "default"))
+    ]
+    parts = [table.assign(target=t) for (t, _, _), table in rows.items() if t != MAIN]
+    held = found.get((MAIN, "default", ""), {}).get("path", "")
+    return {
+        "protocols": _joined(protocols),
+        "table_iv": _joined(sets),
+        "parts": _joined(parts),
+        "coverage": pd.DataFrame() if isinstance(held, str) else coverage(held),
+    }
+
+
+def _joined(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
+
+
+def ceilings(dataset: Dataset | None, targets: Sequence[str]) -> dict[str, dict[str, float]]:
+    """What a repeated drive knows of each target; empty without one."""
+    found: dict[str, dict[str, float]] = {}
+    for target in targets:
+        if dataset is not None and target in dataset.rows:
+            try:
+                found[target] = asdict(ceiling(dataset, target))
+            except ModelError:
+                return {}
+    return found
+
+
+def findings_of(
+    title: str,
+    done: Done,
+    store: TileStore,
+    dataset: Dataset | None,
+    facts: Mapping[str, Any],
+    *,
+    trained_here: bool,
+) -> tuple[Findings, dict[str, Any]]:
+    """All that the report tells, and the figures of the evaluation for machines."""
+    places, found = places_of(done), done.judgements()
+    tables = evaluation_of(found)
+    held = found.get((MAIN, "default", ""), {}).get("path")
+    points = held if isinstance(held, pd.DataFrame) else None
+    weights = [task.out for task in done.estimate if isinstance(task, WeighTask)]
+    weighed = read_tables(weights) if weights else pd.DataFrame({"factor": []})
+    ceiling_of = ceilings(dataset, (MAIN, "error_tail", "p_fail", "error_floor"))
+    whole = Findings(
+        title=title,
+        places=places,
+        labels=pd.DataFrame()
+        if trained_here and points is None
+        else labels_of(dataset, places, points if trained_here else None),
+        protocols=tables["protocols"],
+        table_iv=tables["table_iv"],
+        importances=weighed[weighed["factor"] != ""].reset_index(drop=True),
+        criterion_importances=weighed[weighed["factor"] == ""].reset_index(drop=True),
+        coverage=tables["coverage"],
+        ceiling=ceiling_of.get(MAIN),
+        facts=dict(facts),
+        crs=store.settings.crs,
+        around=lambda x, y, _: points_around(store, x, y, AROUND),
+    )
+    evaluation = {name: table.to_dict("records") for name, table in tables.items()}
+    return whole, evaluation | {"ceilings": ceiling_of}
+
+
+def points_around(store: TileStore, x: float, y: float, reach: float) -> Float64:
+    """The map points within a square of 2 `reach` around a place, (n, 3) [m]."""
+    box = box_around(np.array([[x, y]]), reach)
+    there = [
+        Tile(store, key)
+        for key in store.grid.keys_over(box)
+        if Tile(store, key).mark(POINTS).status == "done"
+    ]
+    points = np.concatenate([np.zeros((0, 3)), *(tile.points() for tile in there)])
+    near = (np.abs(points[:, :2] - (x, y)) <= reach).all(axis=1)
+    kept: Float64 = points[near]
+    return kept

@@ -1,0 +1,317 @@
+"""The main job: a map and some drives in, the estimated error of every sample point out.
+
+```
+simulate? -> read sources -> merge, cells, terms, factors, register, label     (measure)
+          -> join -> judge, weigh, train -> predict                            (estimate)
+          -> report
+```
+"""
+
+import json
+import os
+import platform
+import resource
+import shutil
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import joblib
+import numpy as np
+import pandas as pd
+import yaml
+
+from tilestream.dataflow.calibration import learn
+from tilestream.dataflow.estimate_tasks import (
+    JoinTask,
+    JudgeTask,
+    PredictTask,
+    TrainTask,
+    read_dataset,
+)
+from tilestream.dataflow.factors_tasks import FactorsTask
+from tilestream.dataflow.ingest_map import SourcesRead
+from tilestream.dataflow.localize_tasks import LabelTask, RegisterTask
+from tilestream.dataflow.main_findings import Done, findings_of
+from tilestream.dataflow.main_plan import Inputs, inputs_of, plan_estimate, plan_measure, read_map
+from tilestream.dataflow.plan import Plan, Task
+from tilestream.dataflow.run import Watch, execute, report_kept
+from tilestream.dataflow.run_settings import RunSettings, read_settings
+from tilestream.dataflow.tasks import Outcome
+from tilestream.errors import PartialError
+from tilestream.forest.dataset import Dataset
+from tilestream.report import write_report
+from tilestream.tables import remove_others
+from tilestream.version import VERSION
+
+LARGE = 50_000
+"""Measured places from which on a forest is grown by all workers together."""
+
+
+@dataclass
+class _Book:
+    """What a run did so far; `run.json` is made from it."""
+
+    folder: Path
+    began: float = field(default_factory=time.time)
+    tasks: list[Task] = field(default_factory=list)
+    outcomes: list[Outcome] = field(default_factory=list)
+    failures: dict[str, str] = field(default_factory=dict)
+    facts: dict[str, Any] = field(default_factory=dict)
+
+    def note(self, tasks: Iterable[Task], outcomes: Iterable[Outcome]) -> None:
+        """Enter what ran."""
+        ended = list(outcomes)
+        self.tasks += tasks
+        self.outcomes += ended
+        self.failures |= {outcome.key: outcome.reason for outcome in ended if not outcome.ok}
+
+    def write(self, state: str) -> dict[str, Any]:
+        """Write `run.json`: whole, or as it was."""
+        content = {
+            "state": state,
+            "tilestream": VERSION,
+            "python": platform.python_version(),
+            "numpy": np.__version__,
+            "cores": os.cpu_count(),
+            "began": datetime.fromtimestamp(self.began, UTC).isoformat(timespec="seconds"),
+            "seconds": round(time.time() - self.began, 1),
+            "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1000,
+            "stages": self.stages(),
+            "failures": self.failures,
+            **self.facts,
+        }
+        _write_text(self.folder / "run.json", json.dumps(content, indent=2, default=str) + "\n")
+        return content
+
+    def stages(self) -> dict[str, dict[str, float]]:
+        """Tasks, failures, work and core-seconds of each stage."""
+        work = {task.key: task.work for task in self.tasks}
+        table: dict[str, dict[str, float]] = {}
+        for outcome in self.outcomes:
+            row = table.setdefault(
+                outcome.stage, {"tasks": 0, "failed": 0, "work": 0, "core_seconds": 0.0}
+            )
+            row["tasks"] += 1
+            row["failed"] += not outcome.ok
+            row["work"] += work[outcome.key]
+            row["core_seconds"] = round(row["core_seconds"] + outcome.seconds, 3)
+        return table
+
+
+def run(
+    config: RunSettings | str | os.PathLike[str],
+    client: Any | None = None,
+    watch: Watch | None = None,
+) -> Path:
+    """The whole job: measure errors on drives, learn what the map says of them, estimate all.
+
+    Writes a run directory: `map.zarr/`, `tables/{factors,starts,errors,samples,judged,predictions}`
+    (Parquet with documented columns), `model.skops`, `report/` (`index.html` and its data),
+    `config.yaml` (the effective one), `run.json` (versions, times, counts, failures). A job that
+    was killed continues when it is called again; what changed is redone with what depends on it.
+
+    Args:
+        config: the settings, or a YAML file of them.
+        client: a Dask client to run on; None: this process.
+        watch: is told of each task that ended.
+
+    Returns:
+        The run directory.
+
+    Raises:
+        UsageError: settings that cannot be.
+        SourceError, StoreError: an input that is not there or cannot be read.
+        ModelError: a model in use that does not fit the factors; says what differs.
+        PlanError: a task does not fit `memory`.
+        PartialError: some tasks failed; the message lists them, the rest is done and reported.
+    """
+    settings = config if isinstance(config, RunSettings) else read_settings(config)
+    book = _begin(settings)
+    with report_kept(client, settings.folder / "dask-performance.html"):
+        inputs = inputs_of(settings, client, watch)
+        read = read_map(settings, inputs, client, watch)
+        measure = plan_measure(settings, inputs, read.store, read.merges.tasks, read.identities)
+        _forget_others(settings, measure)
+        measured = _measure(read, measure, client, watch, book)
+        estimate = plan_estimate(settings, measure, measured)
+        estimated = _estimate(estimate, client, watch)
+        book.note(estimate.tasks, estimated)
+    learn(book.tasks, book.outcomes)
+    _report(settings, inputs, read, measure, estimate, book)
+    book.write("failed" if book.failures else "done")
+    if book.failures:
+        raise PartialError(
+            f"{settings.out}: {len(book.failures)} tasks failed, the rest is done:", book.failures
+        )
+    return settings.folder
+
+
+def dataset(run_dir: str | os.PathLike[str]) -> Dataset:
+    """The factors and errors of the same places, as a run has joined them.
+
+    Args:
+        run_dir: a run directory.
+
+    Returns:
+        The dataset: `rows` (a pandas table: place, factors, labels), `columns` (the features),
+        `lost` (labels without a place, with reasons).
+
+    Raises:
+        SourceNotFoundError: no dataset there.
+    """
+    return read_dataset(f"{os.fspath(run_dir)}/tables/samples/dataset.parquet")
+
+
+def _begin(settings: RunSettings) -> _Book:
+    """The run directory with the effective settings."""
+    settings.folder.mkdir(parents=True, exist_ok=True)
+    text = yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+    _write_text(settings.folder / "config.yaml", text)
+    book = _Book(settings.folder)
+    book.write("running")
+    return book
+
+
+def _write_text(path: Path, text: str) -> None:
+    part = path.with_name(f"{path.name}.part")
+    part.write_text(text)
+    part.replace(path)
+
+
+def _forget_others(settings: RunSettings, measure: Plan) -> None:
+    """Remove the tables of other settings, so that two jobs are never mixed in one directory."""
+    by_folder: dict[str, list[str]] = {}
+    for task in measure.tasks:
+        if isinstance(task, FactorsTask | RegisterTask | LabelTask):
+            by_folder.setdefault(task.out.rsplit("/", 1)[0], []).append(task.out)
+    for paths in by_folder.values():
+        remove_others(paths)
+    for kind in ("errors", "starts"):
+        for folder in (settings.folder / "tables" / kind).glob("*/"):
+            if f"{settings.out}/tables/{kind}/{folder.name}" not in by_folder:
+                shutil.rmtree(folder)
+
+
+def _measure(
+    read: SourcesRead, plan: Plan, client: Any | None, watch: Watch | None, book: _Book
+) -> list[Outcome]:
+    """Run the tasks up to the labels; the map is closed as soon as its last tile is written."""
+    open_tiles = {task.key for task in read.merges.tasks}
+    written: list[Outcome] = []
+
+    def watching(outcome: Outcome, ended: int, total: int) -> None:
+        if outcome.key in open_tiles:
+            written.append(outcome)
+            if len(written) == len(open_tiles):
+                order = {task.key: n for n, task in enumerate(read.merges.tasks)}
+                failures = read.close(sorted(written, key=lambda o: order[o.key]))
+                book.failures |= failures
+        if watch is not None:
+            watch(outcome, ended, total)
+
+    if not open_tiles:
+        book.failures |= read.close([])
+    outcomes = execute(plan.tasks, client, watching)
+    book.note(plan.tasks, outcomes)
+    return outcomes
+
+
+def _estimate(plan: Plan, client: Any | None, watch: Watch | None) -> list[Outcome]:
+    """Run the tasks from the dataset to the estimates.
+
+    A forest of very many places is grown by all workers together, through joblib: the same trees.
+    """
+    trains = [task for task in plan.tasks if isinstance(task, TrainTask)]
+    joins = [task for task in plan.tasks if isinstance(task, JoinTask)]
+    if client is None or not trains or sum(join.places for join in joins) < LARGE:
+        return execute(plan.tasks, client, watch)
+    outcomes = execute(joins, client, watch)
+    with client.as_current(), joblib.parallel_config(backend="dask"):
+        outcomes += execute(trains, None, watch)
+    if any(not outcome.ok for outcome in outcomes):
+        return outcomes
+    rest = [task for task in plan.tasks if task not in (*joins, *trains)]
+    return [*outcomes, *execute(rest, client, watch)]
+
+
+def _report(
+    settings: RunSettings,
+    inputs: Inputs,
+    read: SourcesRead,
+    measure: Plan,
+    estimate: Plan,
+    book: _Book,
+) -> None:
+    """Gather what is done and write the report; without a single factor table there is none."""
+    good = {outcome.key for outcome in book.outcomes if outcome.ok}
+    factors = [t.out for t in measure.tasks if isinstance(t, FactorsTask) and t.key in good]
+    if not factors:
+        return
+    finished = tuple(task for task in estimate.tasks if task.key in good)
+    remove_unknown(finished)
+    joined = [task.out for task in finished if isinstance(task, JoinTask)]
+    known = read_dataset(joined[0]) if joined else None
+    if known is not None:
+        book.facts |= {"labelled": len(known), "lost_labels": known.losses}
+    facts = _facts(settings, inputs, book, known)
+    found, evaluation = findings_of(
+        settings.report.title or settings.folder.name,
+        Done(tuple(factors), finished, joined[0] if joined else None),
+        read.store,
+        known,
+        facts,
+        trained_here=settings.model.use is None,
+    )
+    text = json.dumps(_plain(evaluation), indent=1, allow_nan=False)
+    _write_text(settings.folder / "tables" / "evaluation.json", text + "\n")
+    write_report(found, settings.folder / "report", threshold=settings.report.threshold)
+    book.facts["report"] = str(settings.folder / "report" / "index.html")
+
+
+def remove_unknown(finished: Sequence[Task]) -> None:
+    """Remove the judgements and estimates of other settings."""
+    for kind in (JudgeTask, PredictTask):
+        paths = [task.out for task in finished if isinstance(task, kind)]
+        if paths:
+            keep = [f"{paths[0].rsplit('/', 1)[0]}/weights.parquet"] if kind is JudgeTask else []
+            remove_others([*paths, *keep])
+
+
+def _facts(
+    settings: RunSettings, inputs: Inputs, book: _Book, known: Dataset | None
+) -> dict[str, Any]:
+    """What a reader of the report must know of the run."""
+    registration = settings.label.registration.model_dump()
+    stages = {name: f"{row['core_seconds']:.1f} s" for name, row in book.stages().items()}
+    return {
+        "tilestream": VERSION,
+        "map": settings.store_url,
+        "sensor": settings.looking_sensor.name,
+        "cell size [m]": settings.cell_size,
+        "spacing [m]": settings.spacing,
+        "drives": [drive.group for drive in inputs.drives],
+        "labelled places": 0 if known is None else len(known),
+        "lost labels": {} if known is None else known.losses,
+        "model": settings.model.use or f"trained here, recipe {settings.model.recipe}",
+        "matcher": registration,
+        "core-seconds by stage": stages,
+        "failures": dict(book.failures),
+        "notes": list(inputs.notes),
+        "attributions": list(inputs.attributions),
+    }
+
+
+def _plain(value: Any) -> Any:
+    """As JSON has it: no NaN, no NumPy."""
+    if isinstance(value, Mapping):
+        return {str(name): _plain(inner) for name, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(inner) for inner in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    missing = value is None or (not isinstance(value, str) and bool(pd.isna(value)))
+    return None if missing else value

@@ -1,0 +1,295 @@
+"""What the main job will run: settings and files in, plans of tasks out."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tilestream.config import IngestSettings
+from tilestream.dataflow.estimate_tasks import (
+    JOIN_VERSION,
+    TRAIN_VERSION,
+    JoinTask,
+    JudgeTask,
+    PredictTask,
+    TrainTask,
+    WeighTask,
+    file_hash,
+    predictions_identity,
+    train_identity,
+)
+from tilestream.dataflow.factors_route import plan_factors
+from tilestream.dataflow.factors_tasks import FactorsTask, Looking
+from tilestream.dataflow.ingest_map import SourcesRead, read_sources
+from tilestream.dataflow.localize_drive import plan_localize
+from tilestream.dataflow.localize_tasks import LabelTask, Reading
+from tilestream.dataflow.plan import Plan, Task
+from tilestream.dataflow.run import Watch
+from tilestream.dataflow.run_settings import DriveSettings, RunSettings
+from tilestream.dataflow.simulate import simulate
+from tilestream.dataflow.tasks import Outcome
+from tilestream.errors import SourceNotFoundError, UsageError
+from tilestream.factors.catalogue import COLUMNS
+from tilestream.forest.dataset import features_of, made_with
+from tilestream.forest.evaluation import factor_sets
+from tilestream.forest.models import COMPETITORS, FORESTS, OPPONENTS
+from tilestream.formats.mcap import ScanSelection
+from tilestream.formats.routes import read_routes
+from tilestream.records import Route
+from tilestream.simulation.settings import load_preset
+from tilestream.store import TileStore, hash_of, open_store
+from tilestream.tiling import TileKey
+from tilestream.version import VERSION
+
+MAIN = "error_mean"
+PARTS = ("error_tail", "p_fail")
+"""What is judged beside the mean error: what a map can know of it, and the share that is lost."""
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What the main job works on, whether simulated or real."""
+
+    sources: tuple[str, ...]
+    """What the map is made from; empty: a store that is there."""
+    drives: tuple[DriveSettings, ...]
+    """The logs to measure on."""
+    routes: tuple[Route, ...]
+    """Where to estimate."""
+    notes: tuple[str, ...] = ()
+    """What a reader of the results must know."""
+    attributions: tuple[str, ...] = ()
+    """Whose data it is."""
+
+
+def inputs_of(settings: RunSettings, client: Any | None, watch: Watch | None) -> Inputs:
+    """The files of a job; a simulated city is simulated first, as far as it is not there.
+
+    Raises:
+        UsageError: two routes of one name.
+        SourceError: a file that is not there or cannot be read.
+    """
+    if settings.simulate is None:
+        drives = settings.drives
+        files = settings.routes or tuple(dict.fromkeys(drive.log for drive in drives))
+        return Inputs(settings.map.sources, drives, _routes(files, settings))
+    folder = simulated_folder(settings)
+    wanted = settings.simulate
+    preset = load_preset(wanted.preset).model_copy(update={"seed": wanted.seed})
+    for drive in range(wanted.drives):
+        simulate(
+            preset.model_copy(update={"drive": drive}),
+            folder,
+            paths=wanted.paths,
+            scans_per_point=wanted.scans_per_point,
+            size=wanted.size,
+            client=client,
+            watch=watch,
+        )
+    logs = [
+        DriveSettings(log=str(log), name=f"drive{drive}-{log.stem}")
+        for drive in range(wanted.drives)
+        for log in sorted((folder / "logs" / f"drive{drive}").glob("*.mcap"))
+        if wanted.paths is None or log.stem in wanted.paths
+    ]
+    return Inputs(
+        settings.map.sources or (str(folder / "survey" / "*.laz"),),
+        settings.drives or tuple(logs),
+        _routes(settings.routes or (str(folder / "routes.geojson"),), settings),
+        notes=(f"Simulated, preset {preset.preset}: {preset.note}",),
+        attributions=(ATTRIBUTION,),
+    )
+
+
+ATTRIBUTION = (
+    "Building footprints: MLIT Project PLATEAU by way of indigo-lab/plateau-lod2-mvt, clipped, "
+    "CC BY 4.0."
+)
+
+
+def simulated_folder(settings: RunSettings) -> Path:
+    """Where a simulated city is kept."""
+    assert settings.simulate is not None
+    return Path(settings.simulate.folder or settings.folder / "simulation")
+
+
+def _routes(files: Sequence[str], settings: RunSettings) -> tuple[Route, ...]:
+    found = [r for path in files for r in read_routes(path, project_to=settings.project_to)]
+    names = [route.route_id for route in found]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise UsageError(f"two routes are named {', '.join(twice)}: give each its own name")
+    return tuple(found)
+
+
+def read_map(
+    settings: RunSettings, inputs: Inputs, client: Any | None, watch: Watch | None
+) -> SourcesRead:
+    """The map's sources, read; or the store that is there.
+
+    Raises:
+        StoreNotFoundError, SourceError, PlanError: as `ingest`.
+    """
+    if not inputs.sources:
+        return SourcesRead(open_store(settings.store_url), (), Plan((), settings.memory))
+    names = set(IngestSettings.model_fields)
+    ingest = IngestSettings(**settings.map.model_dump(include=names))
+    logs = any(source.lower().endswith(".mcap") for source in inputs.sources)
+    return read_sources(
+        inputs.sources,
+        settings.store_url,
+        ingest,
+        client=client,
+        memory=settings.memory,
+        watch=watch,
+        points_topic=settings.map.points_topic,
+        pose_topic=settings.map.pose_topic,
+        scans=ScanSelection(every=settings.map.every, offset=settings.map.offset) if logs else None,
+    )
+
+
+def plan_measure(
+    settings: RunSettings,
+    inputs: Inputs,
+    store: TileStore,
+    merges: Sequence[Task],
+    have: Mapping[TileKey, str],
+) -> Plan:
+    """Tiles, factors and errors: every task needs only the tiles around it.
+
+    Args:
+        settings: the job.
+        inputs: its files.
+        store: the map, as far as it is there.
+        merges: the tasks that write what is not there yet.
+        have: the identity that the points of each tile have or will have.
+    """
+    tables = f"{settings.out}/tables"
+    looking = Looking(settings.looking_sensor, settings.cell_size, "all", settings.sensor_height)
+    planned = [
+        plan_factors(store, inputs.routes, tables, settings.spacing, looking, settings.memory, have)
+    ]
+    for drive in inputs.drives:
+        scans = ScanSelection(
+            every=drive.every, offset=drive.offset, from_s=drive.from_s, until_s=drive.until_s
+        )
+        planned.append(
+            plan_localize(
+                store,
+                reading_of(drive),
+                tables,
+                cell_size=settings.cell_size,
+                spacing=settings.spacing,
+                registration=settings.label.registration,
+                starts=settings.label.starts,
+                true_pose=settings.label.true_pose,
+                scans=scans,
+                starts_per_task=None,
+                memory=settings.memory,
+                group=drive.group,
+                have=have,
+            )
+        )
+    tasks = {task.key: task for plan in planned for task in plan.tasks}
+    return Plan((*merges, *tasks.values()), settings.memory).check()
+
+
+def reading_of(drive: DriveSettings) -> Reading:
+    """How a drive's log is read.
+
+    Raises:
+        SourceNotFoundError: there is no such log.
+    """
+    if not Path(drive.log).is_file():
+        raise SourceNotFoundError(f"{drive.log}: no such log; see drives in the config")
+    return Reading(
+        drive.log,
+        drive.points_topic,
+        drive.pose_topic,
+        drive.beams,
+        drive.range_max,
+        drive.blind_rear_deg,
+        drive.deskew or drive.sweep_s is not None,
+        drive.sweep_s,
+    )
+
+
+def plan_estimate(settings: RunSettings, measure: Plan, outcomes: Sequence[Outcome]) -> Plan:
+    """Join, judge, train, predict: from what was measured.
+
+    What failed is left out here and listed by the run, so that a tile that cannot be read does not
+    keep the rest of the city from its estimates.
+    """
+    done = {outcome.key for outcome in outcomes if outcome.ok}
+    factors = [t for t in measure.tasks if isinstance(t, FactorsTask) and t.key in done]
+    labels = [t for t in measure.tasks if isinstance(t, LabelTask) and t.key in done]
+    making = made_with(COLUMNS, settings.looking_sensor, settings.cell_size)
+    tables, tasks = f"{settings.out}/tables", list[Task]()
+    model, state = str(settings.folder / "model.skops"), ""
+    if labels and factors:
+        groups: dict[str, list[str]] = {}
+        for label in labels:
+            groups.setdefault(label.group, []).append(label.out)
+        identity = hash_of(
+            [t.identity for t in factors],
+            [t.identity for t in labels],
+            making,
+            JOIN_VERSION,
+            VERSION,
+        )
+        join = JoinTask(
+            tuple(task.out for task in factors),
+            tuple((group, tuple(paths)) for group, paths in groups.items()),
+            tuple(making.items()),
+            f"{tables}/samples/dataset.parquet",
+            identity,
+            sum(task.work for task in labels),
+        )
+        tasks.append(join)
+        if settings.model.use is None:
+            state = train_identity(identity, settings.model.recipe, settings.model.seed)
+            seed = settings.model.seed
+            tasks.append(TrainTask(join.out, settings.model.recipe, seed, model, state))
+            tasks += judges(join, f"{tables}/judged", seed)
+    if settings.model.use is not None:
+        if not Path(settings.model.use).is_file():
+            raise SourceNotFoundError(f"{settings.model.use}: no such model file")
+        model, state = settings.model.use, file_hash(settings.model.use)
+    if state:
+        tasks += [
+            PredictTask(
+                model,
+                state,
+                task.out,
+                str(task.tile),
+                tuple(making.items()),
+                f"{tables}/predictions/{task.tile}.parquet",
+                predictions_identity(state, task.identity, making),
+                task.work,
+            )
+            for task in factors
+        ]
+    return Plan(tuple(tasks), settings.memory).check()
+
+
+def judges(join: JoinTask, folder: str, seed: int) -> list[Task]:
+    """Every model and opponent on all factors, and the forests on each set of Table IV."""
+    wanted = [(MAIN, competitor, "") for competitor in COMPETITORS]
+    sets = [name for name in factor_sets(features_of(COLUMNS)) if name != "all + robust"]
+    wanted += [(MAIN, forest, name) for name in sets for forest in FORESTS]
+    simple = [name for name in OPPONENTS if name != "footprint forest"]
+    wanted += [(target, name, "") for target in PARTS for name in ("default", *simple)]
+    tasks: list[Task] = [
+        JudgeTask(
+            join.out,
+            competitor,
+            target,
+            factor_set,
+            seed,
+            f"{folder}/{target}-{competitor}-{factor_set or 'all'}.parquet".replace(" ", "_"),
+            hash_of(join.identity, target, competitor, factor_set, seed, TRAIN_VERSION, VERSION),
+        )
+        for target, competitor, factor_set in wanted
+    ]
+    weigh = hash_of(join.identity, seed, TRAIN_VERSION, VERSION)
+    return [*tasks, WeighTask(join.out, seed, f"{folder}/weights.parquet", weigh)]
