@@ -1,0 +1,13 @@
+"""The way out: what a run found, as one page for people and as files for programs.
+
+```
+findings --> judgement (segments, worst places) --> summary --+--> exports (parquet, geojson, …)
+                                                              +--> charts, pictures --> page
+```
+"""
+
+from tilestream.report.findings import Findings
+from tilestream.report.judgement import exceeds
+from tilestream.report.write import write_report
+
+__all__ = ["Findings", "exceeds", "write_report"]

@@ -1,0 +1,168 @@
+"""Tables and maps for other programs; every file is whole or not there."""
+
+import io
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+from pyproj import CRS, Transformer
+from pyproj.exceptions import CRSError
+
+from tilestream.errors import CrsError
+from tilestream.factors.catalogue import COLUMNS
+from tilestream.forest.dataset import SPREAD_ACROSS, SPREAD_ALONG, WEAK_ALONG
+from tilestream.forest.training import PREDICTION_COLUMNS
+from tilestream.formats.pcd import write_pcd
+from tilestream.formats.rows import writing_whole
+from tilestream.records import Float64
+from tilestream.report.colours import scale_of
+from tilestream.report.findings import Findings, estimates
+from tilestream.report.judgement import segments
+from tilestream.report.summary import plain, segment
+
+GEOPARQUET = "1.1.0"
+POINT_Z = 1001
+"""ISO WKB code of a point with z."""
+_WKB = np.dtype([("order", "u1"), ("kind", "<u4"), ("xyz", "<f8", 3)])
+_CATALOGUE = {
+    column.name: column
+    for column in (*COLUMNS, WEAK_ALONG, SPREAD_ALONG, SPREAD_ACROSS, *PREDICTION_COLUMNS)
+}
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write text as UTF-8."""
+    with writing_whole(path) as file:
+        file.write(text.encode("utf-8"))
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write strict JSON: what is not a number is null."""
+    write_text(path, json.dumps(plain(content), indent=1, allow_nan=False) + "\n")
+
+
+def write_csv(path: Path, places: pd.DataFrame) -> None:
+    """Write the places; numbers as they are, to the bit, and empty where there is none."""
+    write_text(path, places.to_csv(index=False, lineterminator="\n"))
+
+
+def write_geoparquet(path: Path, found: Findings) -> None:
+    """Write the places as GeoParquet 1.1: a WKB point each, null where a coordinate is missing.
+
+    Raises:
+        CrsError: a CRS that pyproj does not know.
+    """
+    at = found.places[["x", "y", "z"]].to_numpy(np.float64)
+    placed = np.isfinite(at).all(axis=1)
+    crs = _crs(found.crs)
+    geometry = {
+        "encoding": "WKB",
+        "geometry_types": ["Point Z"],
+        # null says unknown; without the member a reader would take degrees for granted
+        "crs": None if crs is None else crs.to_json_dict(),
+        "edges": "planar",
+    }
+    if placed.any():
+        bounds = np.concatenate([at[placed].min(axis=0), at[placed].max(axis=0)])
+        geometry["bbox"] = bounds.tolist()
+    geo = {"version": GEOPARQUET, "primary_column": "geometry", "columns": {"geometry": geometry}}
+    table = pa.Table.from_pandas(found.places, preserve_index=False)
+    table = table.append_column("geometry", pa.array(_wkb(at, placed), pa.binary()))
+    schema = pa.schema(
+        [_documented(field) for field in table.schema], {b"geo": json.dumps(geo).encode()}
+    )
+    buffer = io.BytesIO()
+    pq.write_table(table.cast(schema), buffer, compression="zstd")
+    with writing_whole(path) as file:
+        file.write(buffer.getvalue())
+
+
+def _wkb(at: Float64, placed: np.ndarray[Any, np.dtype[np.bool_]]) -> list[bytes | None]:
+    rows = np.zeros(len(at), _WKB)
+    rows["order"], rows["kind"], rows["xyz"] = 1, POINT_Z, at
+    return [row.tobytes() if good else None for row, good in zip(rows, placed, strict=True)]
+
+
+def _documented(field: pa.Field) -> pa.Field:
+    column = _CATALOGUE.get(field.name)
+    if column is None:
+        return field
+    return field.with_metadata(
+        {"unit": column.unit, "meaning": column.meaning, "source": column.source}
+    )
+
+
+def write_geojson(path: Path, found: Findings, threshold: float) -> None:
+    """Write the segments over a threshold: lines, and points where one sample point stands alone.
+
+    Positions are longitude and latitude, as GeoJSON wants; of a map without a CRS they are its
+    metres, and the member `coordinates` of the collection says so.
+
+    Raises:
+        CrsError: a CRS that pyproj does not know.
+    """
+    crs = _crs(found.crs)
+    at = found.places[["x", "y", "z"]].to_numpy(np.float64).copy()
+    if crs is not None:
+        to_degrees = Transformer.from_crs(crs, CRS.from_epsg(4326), always_xy=True)
+        at[:, 0], at[:, 1] = to_degrees.transform(at[:, 0], at[:, 1])
+    features = []
+    for rows in segments(found.places, threshold):
+        positions = [
+            [round(x, 9), round(y, 9)] + ([round(z, 3)] if np.isfinite(z) else [])
+            for x, y, z in at[rows].tolist()
+            if np.isfinite([x, y]).all()
+        ]
+        single = len(positions) == 1
+        geometry = {
+            "type": "Point" if single else "LineString",
+            "coordinates": positions[0] if single else positions,
+        }
+        features.append(
+            {
+                "type": "Feature",
+                "properties": segment(found.places, rows),
+                "geometry": geometry if positions else None,
+            }
+        )
+    degrees = "longitude, latitude (WGS 84); z as in the map [m]"
+    collection = {
+        "type": "FeatureCollection",
+        "name": "over_threshold",
+        "threshold": threshold,
+        "coordinates": degrees if crs is not None else "map frame [m]; the map names no CRS",
+        "features": features,
+    }
+    write_json(path, collection)
+
+
+def _crs(name: str | None) -> CRS | None:
+    try:
+        return None if name is None else CRS.from_user_input(name)
+    except CRSError as error:
+        raise CrsError(f"{name!r} is no CRS that pyproj knows ({error})") from error
+
+
+def write_cloud(path: Path, places: pd.DataFrame) -> int:
+    """Write the sample points as PCD, coloured as on the map (`rgb` as PCL packs it), with their
+    `estimate` [m]; grey and NaN where there is none.
+
+    Returns:
+        How many places have no position and are not in it.
+    """
+    at = places[["x", "y", "z"]].to_numpy(np.float64)
+    placed = np.isfinite(at).all(axis=1)
+    estimate = estimates(places)
+    rgb = scale_of(estimate).rgb(estimate[placed]).astype(np.uint32)
+    packed = (rgb[:, 0] << 16) | (rgb[:, 1] << 8) | rgb[:, 2]
+    fields = {
+        "rgb": packed.view(np.float32),
+        "estimate": estimate[placed].astype(np.float32),
+    }
+    write_pcd(path, at[placed], fields=fields)
+    return int((~placed).sum())

@@ -1,0 +1,95 @@
+"""What a report is made of: the tables that the other rooms return, checked once."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from tilestream.errors import UsageError
+from tilestream.forest.training import PREDICTION_COLUMNS
+from tilestream.records import Float64
+
+PLACE_COLUMNS = ("route_id", "sample", "arc_length", "heading", "x", "y", "z")
+"""Where a sample point is: its route, its number there, and the map frame [m, rad]."""
+LABEL_COLUMNS = ("group", "path", "arc_length", "error_mean", "held_out")
+"""What a labelled place must have."""
+AROUND = 40.0
+"""How far round a place its picture reaches [m]."""
+Around = Callable[[float, float, float], Float64]
+"""(n, 3) map points [m] within about `AROUND` of a place in the map frame."""
+
+
+def _none() -> pd.DataFrame:
+    return pd.DataFrame()
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """All that is told about a run. An empty table is told as empty, with what that means.
+
+    Raises:
+        UsageError: no places, a column that a table lacks, a place that is there twice.
+    """
+
+    title: str
+    """Headline of the page."""
+    places: pd.DataFrame
+    """A row per sample point: `PLACE_COLUMNS`, `PREDICTION_COLUMNS` and the factors."""
+    labels: pd.DataFrame = field(default_factory=_none)
+    """A row per drive and labelled place: `Dataset.rows`, and `held_out` [m]: the estimate by a
+    model that has not seen the place's path; NaN where there is none."""
+    protocols: pd.DataFrame = field(default_factory=_none)
+    """`evaluation.compare`."""
+    table_iv: pd.DataFrame = field(default_factory=_none)
+    """`evaluation.table_iv`."""
+    importances: pd.DataFrame = field(default_factory=_none)
+    """`evaluation.importances`."""
+    criterion_importances: pd.DataFrame = field(default_factory=_none)
+    """`evaluation.criterion_importances`."""
+    coverage: pd.DataFrame = field(default_factory=_none)
+    """`intervals.coverage`."""
+    ceiling: dict[str, float] | None = None
+    """The fields of `evaluation.ceiling`'s figures; None without a repeated drive."""
+    facts: dict[str, Any] = field(default_factory=dict)
+    """Run facts by name; a dictionary among them becomes a table of its own. `notes` and
+    `attributions` are lists of sentences."""
+    crs: str | None = None
+    """CRS of x and y, anything that pyproj reads; None: a local frame."""
+    around: Around | None = None
+    """The map round a place, for the pictures of the worst ones; None: no pictures."""
+
+    def __post_init__(self) -> None:
+        predicted = tuple(column.name for column in PREDICTION_COLUMNS)
+        _require(self.places, (*PLACE_COLUMNS, *predicted), "places")
+        if self.places.empty:
+            raise UsageError("a report needs places: give at least one sample point")
+        twice = self.places.duplicated(["route_id", "sample"])
+        if twice.any():
+            row = self.places[twice].iloc[0]
+            raise UsageError(f"places: route {row['route_id']!r} has sample {row['sample']} twice")
+        if len(self.labels):
+            _require(self.labels, LABEL_COLUMNS, "labels")
+        for name in ("places", "labels"):
+            object.__setattr__(self, name, _in_order(getattr(self, name)))
+
+
+def _require(table: pd.DataFrame, names: tuple[str, ...], what: str) -> None:
+    absent = [name for name in names if name not in table]
+    if absent:
+        raise UsageError(f"{what}: no column {', '.join(absent)}")
+
+
+def _in_order(table: pd.DataFrame) -> pd.DataFrame:
+    """Rows along each route or path, so that a report does not depend on the order of tiles."""
+    keys = [k for k in ("route_id", "sample", "path", "arc_length", "group") if k in table]
+    if not keys or table.empty:
+        return table.reset_index(drop=True)
+    keys = ["route_id", "sample"] if "route_id" in table else ["path", "arc_length", "group"]
+    return table.sort_values(keys, kind="stable").reset_index(drop=True)
+
+
+def estimates(places: pd.DataFrame) -> Float64:
+    """(n,) the estimates [m]; NaN where there is none."""
+    return places["estimate"].to_numpy(np.float64)

@@ -1,0 +1,39 @@
+"use strict";
+(() => {
+  const dark = window.matchMedia("(prefers-color-scheme: dark)");
+  const printing = window.matchMedia("print");
+
+  function paint() {
+    const night = dark.matches && !printing.matches;
+    const ink = night ? "#c9ced5" : "#3c434b";
+    const line = night ? "#59616b" : "#c3c6c9";
+    for (const doc of Bokeh.documents) {
+      for (const root of doc.roots()) {
+        for (const model of root.references()) {
+          if (model.type === "LinearAxis") {
+            model.setv({
+              axis_label_text_color: ink, major_label_text_color: ink, axis_line_color: line,
+              major_tick_line_color: line, axis_label_text_font_style: "normal",
+            });
+          } else if (model.type === "Grid") {
+            model.setv({ grid_line_color: line });
+          } else if (model.type === "Legend") {
+            model.setv({ label_text_color: ink, inactive_fill_color: night ? "#1d2126" : "#ffffff" });
+          } else if (model.type === "ColorBar") {
+            model.setv({ title_text_color: ink, major_label_text_color: ink, title_text_font_style: "normal" });
+          }
+        }
+      }
+    }
+  }
+
+  Bokeh.set_log_level("warn");
+  const items = [...document.querySelectorAll("script.chart-data")].map((s) => JSON.parse(s.textContent));
+  Promise.all(items.map((item) => Bokeh.embed.embed_item(item))).then(() => {
+    paint();
+    dark.addEventListener("change", paint);
+    window.addEventListener("beforeprint", paint);
+    window.addEventListener("afterprint", paint);
+    document.documentElement.dataset.charts = String(items.length);
+  });
+})();

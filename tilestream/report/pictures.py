@@ -1,0 +1,216 @@
+"""Pictures as PNG: the worst places from above, and the charts for papers and slides."""
+
+import io
+from collections.abc import Callable
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from tilestream.records import Float64
+from tilestream.report.colours import (
+    ACTUAL,
+    AGAIN,
+    CRITERION,
+    HELD_OUT,
+    MISSING,
+    OTHER,
+    palette,
+    scale_of,
+)
+from tilestream.report.findings import AROUND, Findings, estimates
+from tilestream.report.judgement import worst_places
+from tilestream.report.summary import interval_factor, with_gaps
+from tilestream.report.words import CM_PER_M
+
+PIXEL = 0.25
+"""Edge of a pixel of the view from above [m]."""
+BELOW, ABOVE = 3.0, 10.0
+"""Heights that the colours span, below and above the lidar [m]."""
+PATHS_ON_A_FIGURE = 12
+Draw = Callable[[], Figure]
+
+
+def png(figure: Figure, dpi: int = 110) -> bytes:
+    """A figure as PNG; the same figure gives the same bytes."""
+    FigureCanvasAgg(figure)
+    buffer = io.BytesIO()
+    figure.savefig(
+        buffer, format="png", dpi=dpi, metadata={"Software": None}, pil_kwargs={"optimize": True}
+    )
+    return buffer.getvalue()
+
+
+def surroundings(points: Float64, place: Float64, heading: float) -> Figure:
+    """The map round a place from above, coloured by height, north (map y) up.
+
+    Args:
+        points: (n, 3) map points [m].
+        place: (3,) the place of the lidar [m].
+        heading: of travel there [rad].
+    """
+    height = _seen_from_above(points - place)
+    figure = Figure(figsize=(3.4, 3.4), layout="constrained")
+    axes = figure.add_subplot()
+    axes.set_facecolor("#15181d")
+    image = axes.imshow(
+        height,
+        origin="lower",
+        extent=(-AROUND, AROUND, -AROUND, AROUND),
+        cmap="viridis",
+        vmin=-BELOW,
+        vmax=ABOVE,
+        interpolation="nearest",
+    )
+    step = 11.0 * np.array([np.cos(heading), np.sin(heading)])
+    arrow = {"arrowstyle": "-|>", "color": "#ff5a36", "lw": 2.2, "mutation_scale": 16}
+    axes.annotate("", xy=(step[0], step[1]), xytext=(0.0, 0.0), arrowprops=arrow)
+    axes.plot(0.0, 0.0, "o", ms=7, color="#ff5a36", mec="white", mew=1.2)
+    axes.plot([-36.0, -26.0], [-36.0, -36.0], color="white", lw=2.0)
+    axes.text(-31.0, -34.5, "10 m", color="white", ha="center", va="bottom", fontsize=8)
+    axes.set(xlim=(-AROUND, AROUND), ylim=(-AROUND, AROUND), xticks=[], yticks=[])
+    bar = figure.colorbar(image, ax=axes, shrink=0.8, pad=0.02, extend="both")
+    bar.set_label("height from the lidar [m]", fontsize=7)
+    bar.ax.tick_params(labelsize=7)
+    return figure
+
+
+def _seen_from_above(offset: Float64) -> Float64:
+    """The highest point of each pixel up to what overhangs the road [m]; NaN where nothing is."""
+    size = round(2.0 * AROUND / PIXEL)
+    image = np.full((size, size), -np.inf)
+    column, row = np.floor((offset[:, :2].T + AROUND) / PIXEL).astype(np.int64)
+    inside = (column >= 0) & (column < size) & (row >= 0) & (row < size)
+    np.maximum.at(image, (row[inside], column[inside]), offset[inside, 2])
+    return np.where(np.isfinite(image), image, np.nan)
+
+
+def map_figure(found: Findings) -> Figure:
+    """The city map, coloured by estimate, the worst places numbered."""
+    places, estimate = found.places, estimates(found.places)
+    at, known = places[["x", "y"]].to_numpy(np.float64), np.isfinite(estimate)
+    scale = scale_of(estimate)
+    figure = Figure(figsize=(10.0, 7.5), layout="constrained")
+    axes = figure.add_subplot()
+    axes.scatter(at[~known, 0], at[~known, 1], s=8, c=MISSING, marker="x", lw=0.8)
+    order = np.flatnonzero(known)[np.argsort(estimate[known], kind="stable")]
+    colours = np.array(palette())
+    step = scale.step(estimate[order])
+    axes.scatter(at[order, 0], at[order, 1], s=8 + step / 6.0, c=colours[step].tolist(), lw=0)
+    for number, row in enumerate(worst_places(places), start=1):
+        box = {"boxstyle": "circle,pad=0.25", "fc": "#111111", "ec": "white"}
+        axes.annotate(
+            str(number), at[row], (0, 12), textcoords="offset points", ha="center", color="white",
+            fontsize=8, bbox=box,
+        )  # fmt: skip
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set(xlabel="x [m]", ylabel="y [m]", title="Estimated localization error")
+    axes.grid(alpha=0.25)
+    axes.ticklabel_format(useOffset=False, style="plain")
+    _colour_bar(axes, scale.low, scale.high)
+    return figure
+
+
+def _colour_bar(axes: Axes, low: float, high: float) -> None:
+    bar = axes.inset_axes((1.02, 0.1, 0.02, 0.8))
+    ramp = np.array([[int(c[k : k + 2], 16) / 255.0 for k in (1, 3, 5)] for c in palette()])
+    bar.imshow(ramp[:, None], origin="lower", aspect="auto",
+               extent=(0.0, 1.0, low * CM_PER_M, high * CM_PER_M))  # fmt: skip
+    bar.set(xticks=[], ylabel="estimated error [cm]")
+    bar.yaxis.set_label_position("right")
+    bar.yaxis.tick_right()
+
+
+def paths_figure(found: Findings) -> Figure:
+    """Measured error and held-out estimate along each path (the paper's Fig. 12 and 13)."""
+    names = sorted(set(found.labels["path"].astype(str)))[:PATHS_ON_A_FIGURE]
+    figure = Figure(figsize=(10.0, 2.1 * len(names) + 0.6), layout="constrained")
+    panels = figure.subplots(len(names), 1, squeeze=False)[:, 0]
+    for axes, name in zip(panels, names, strict=True):
+        here = found.labels[found.labels["path"].astype(str) == name]
+        factor = interval_factor(found.coverage, name)
+        for number, (_, part) in enumerate(here.groupby("group", sort=True)):
+            _draw_drive(axes, part, factor if number == 0 else None, again=number > 0)
+        axes.set_title(f"path {name}", loc="left", fontsize=10)
+        axes.set(ylabel="error [cm]", ylim=(0.0, None))
+        axes.grid(alpha=0.25)
+    panels[-1].set_xlabel("along the path [m]")
+    figure.legend(
+        handles=[
+            Line2D([], [], color=ACTUAL, label="measured"),
+            Line2D([], [], color=AGAIN, ls="--", label="measured again"),
+            Line2D([], [], color=HELD_OUT, label="estimate of a model without the path"),
+            Patch(color=HELD_OUT, alpha=0.18, label="its interval"),
+        ],
+        loc="outside upper center",
+        ncols=4,
+        frameon=False,
+    )
+    return figure
+
+
+def _draw_drive(axes: Axes, part: pd.DataFrame, factor: float | None, *, again: bool) -> None:
+    arc = part["arc_length"].to_numpy(np.float64)
+    breaks = with_gaps(arc)
+    arc = np.insert(arc, breaks, np.nan)
+    measured, held = (
+        np.insert(part[name].to_numpy(np.float64), breaks, np.nan) * CM_PER_M
+        for name in ("error_mean", "held_out")
+    )
+    style = {"color": AGAIN, "ls": "--", "lw": 1.0} if again else {"color": ACTUAL, "lw": 1.2}
+    axes.plot(arc, measured, **style)  # type: ignore[arg-type]
+    axes.plot(arc, held, color=HELD_OUT, lw=1.3, ls=":" if again else "-")
+    if factor is not None:
+        axes.fill_between(arc, held / factor, held * factor, color=HELD_OUT, alpha=0.18, lw=0)
+
+
+def importances_figure(importances: pd.DataFrame) -> Figure:
+    """The forest's own importance of each factor, coloured by criterion (the paper's Fig. 14)."""
+    ranked = importances.sort_values("importance", kind="stable")
+    figure = Figure(figsize=(8.0, 0.24 * len(ranked) + 1.0), layout="constrained")
+    axes = figure.add_subplot()
+    colours = [CRITERION.get(str(c), OTHER) for c in ranked["criterion"]]
+    axes.barh(np.arange(len(ranked)), ranked["importance"].to_numpy(np.float64), color=colours)
+    axes.set_yticks(np.arange(len(ranked)), ranked["factor"].astype(str), fontsize=8)
+    axes.set(xlabel="importance", ylim=(-0.6, len(ranked) - 0.4))
+    axes.grid(axis="x", alpha=0.25)
+    there = [c for c in CRITERION if c in set(ranked["criterion"].astype(str))]
+    axes.legend(handles=[Patch(color=CRITERION[c], label=c) for c in there], frameon=False)
+    return figure
+
+
+def coverage_figure(coverage: pd.DataFrame) -> Figure:
+    """Share of each path's measured errors inside the intervals, against the promise."""
+    figure = Figure(figsize=(7.0, 0.4 * len(coverage) + 1.3), layout="constrained")
+    axes = figure.add_subplot()
+    row = np.arange(len(coverage))[::-1]
+    covered, level = (coverage[c].to_numpy(np.float64) for c in ("covered", "level"))
+    axes.barh(row, covered, color=ACTUAL, height=0.6, label="inside")
+    axes.plot(level, row, "|", color=HELD_OUT, ms=18, mew=2.5, label="promised")
+    axes.set_yticks(row, coverage["path"].astype(str))
+    axes.set(xlim=(0.0, 1.0), xlabel="share of the measured errors inside the interval")
+    axes.legend(frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
+    return figure
+
+
+def distribution_figure(found: Findings) -> Figure:
+    """How large errors are, as the share of places above each error, measured and estimated."""
+    figure = Figure(figsize=(7.0, 4.0), layout="constrained")
+    axes = figure.add_subplot()
+    curves = [("estimated, all places", estimates(found.places), HELD_OUT)]
+    if len(found.labels):
+        measured = found.labels["error_mean"].to_numpy(np.float64)
+        curves.append(("measured, labelled places", measured, ACTUAL))
+    for name, errors, colour in curves:
+        there = np.sort(errors[np.isfinite(errors)]) * CM_PER_M
+        if there.size:
+            above = 1.0 - np.arange(1, there.size + 1) / there.size
+            axes.step(there, above, where="post", color=colour, label=name)
+    axes.set(xlabel="error [cm]", ylabel="share of places above it", ylim=(0.0, 1.0))
+    axes.grid(alpha=0.25)
+    axes.legend(frameon=False)
+    return figure

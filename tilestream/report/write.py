@@ -1,0 +1,109 @@
+"""Findings in, a folder out."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from tilestream.errors import TilestreamError
+from tilestream.formats.rows import writing_whole
+from tilestream.report import pictures
+from tilestream.report.exports import (
+    write_cloud,
+    write_csv,
+    write_geojson,
+    write_geoparquet,
+    write_json,
+    write_text,
+)
+from tilestream.report.findings import Findings
+from tilestream.report.judgement import check_threshold
+from tilestream.report.page import page
+from tilestream.report.summary import plain, summary
+from tilestream.report.words import known
+
+THRESHOLD = 0.25
+"""Estimates above this are too large [m]: the paper's, and where Autoware warns."""
+
+
+def write_report(
+    findings: Findings, folder: str | Path, *, threshold: float = THRESHOLD
+) -> dict[str, Any]:
+    """Write the page and the files beside it: each of them whole, or not there.
+
+    `index.html` (needs no network), `places.parquet` (GeoParquet), `places.csv`,
+    `over_threshold.geojson`, `map.pcd`, `report.json`, `figures/*.png`. Files of these names are
+    replaced; figures of an earlier report that this one lacks are removed.
+
+    Args:
+        findings: what is reported.
+        folder: where to; made where it does not exist.
+        threshold: estimates above this are too large [m].
+
+    Returns:
+        The content of `report.json`.
+
+    Raises:
+        UsageError: a threshold that is no positive length.
+        CrsError: a CRS that pyproj does not know.
+    """
+    check_threshold(threshold)
+    place = Path(folder)
+    (place / "figures").mkdir(parents=True, exist_ok=True)
+    content = summary(findings, threshold)
+    write_geoparquet(place / "places.parquet", findings)
+    write_geojson(place / "over_threshold.geojson", findings, threshold)
+    write_csv(place / "places.csv", findings.places)
+    content["not_in_cloud"] = write_cloud(place / "map.pcd", findings.places)
+    worst = _worst(findings, content)
+    content["figures"] = _write_figures(place / "figures", findings, worst)
+    write_text(place / "index.html", page(findings, content, worst))
+    write_json(place / "report.json", content)
+    return dict(plain(content))
+
+
+def _worst(findings: Findings, content: Mapping[str, Any]) -> dict[int, bytes | str]:
+    """The surroundings of each of the worst places as PNG, or why there is no picture."""
+    return {
+        number: _picture(findings, worst) for number, worst in enumerate(content["worst"], start=1)
+    }
+
+
+def _picture(findings: Findings, worst: Mapping[str, Any]) -> bytes | str:
+    if findings.around is None:
+        return "the report was made without the map"
+    if not all(known(worst[name]) for name in ("x", "y", "z", "heading")):
+        return "the place has no position"
+    x, y, z = float(worst["x"]), float(worst["y"]), float(worst["z"])
+    try:
+        points = findings.around(x, y, z)
+    except TilestreamError as error:
+        return str(error)
+    if not len(points):
+        return "no map points around it"
+    return pictures.png(pictures.surroundings(points, np.array([x, y, z]), worst["heading"]))
+
+
+def _write_figures(folder: Path, findings: Findings, worst: Mapping[int, bytes | str]) -> list[str]:
+    """Write what there is to draw; the names of the files."""
+    drawn: dict[str, Callable[[], Figure]] = {
+        "map.png": lambda: pictures.map_figure(findings),
+        "distribution.png": lambda: pictures.distribution_figure(findings),
+    }
+    if len(findings.labels):
+        drawn["paths.png"] = lambda: pictures.paths_figure(findings)
+    if len(findings.importances):
+        drawn["importances.png"] = lambda: pictures.importances_figure(findings.importances)
+    if len(findings.coverage):
+        drawn["coverage.png"] = lambda: pictures.coverage_figure(findings.coverage)
+    files = {name: pictures.png(draw()) for name, draw in drawn.items()}
+    files |= {f"worst_{n:02d}.png": data for n, data in worst.items() if isinstance(data, bytes)}
+    for name, data in files.items():
+        with writing_whole(folder / name) as file:
+            file.write(data)
+    for old in folder.glob("*.png"):
+        if old.name not in files:
+            old.unlink()
+    return sorted(files)
