@@ -38,9 +38,9 @@ KNOWN_ONLY_BY = {
 def step_in_dataflow(name: str) -> int:
     """plan < tasks < run < the tasks of each job < the jobs < the main job, over all of them."""
     first = ("plan", "tasks", "run", "run_settings")
-    main = ("main_plan", "main_findings", "main_job")
+    main = {"estimate_tasks": 5, "main_plan": 6, "main_findings": 6, "main_job": 7}
     if name in main:
-        return 5 + (name == "main_job")
+        return main[name]
     return first.index(name) if name in first else 3 if name.endswith("_tasks") else 4
 
 

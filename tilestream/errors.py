@@ -69,6 +69,10 @@ class PlanError(TilestreamError):
     """A job that does not fit what it was promised (memory, disk); says what to change."""
 
 
+class LimitError(TilestreamError):
+    """The job is done, and an estimate is above the limit that was given."""
+
+
 class PartialError(TaskError):
     """A job that ended with some of its work failed; everything else is done and usable."""
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from tempfile import mkdtemp
 from typing import Annotated, Any, Literal
 
+import pandas as pd
 import typer
 import yaml
 from rich.console import Console
@@ -23,21 +24,27 @@ from tilestream.cli.tables import (
     error_facts,
     error_table,
     factor_table,
+    forecast_rows,
+    forecast_table,
     info_table,
     plan_table,
+    report_table,
     tile_table,
 )
 from tilestream.config import IngestSettings, RegistrationSettings, StartSettings
-from tilestream.dataflow import ingest_map
+from tilestream.dataflow import ingest_map, main_job
 from tilestream.dataflow.factors_route import factors_along, plan_factors
 from tilestream.dataflow.factors_tasks import Looking
 from tilestream.dataflow.localize_drive import localize as localize_drive
 from tilestream.dataflow.localize_drive import plan_localize
 from tilestream.dataflow.localize_tasks import Reading
+from tilestream.dataflow.main_plan import forecast
 from tilestream.dataflow.run import dask_client
+from tilestream.dataflow.run_settings import read_settings
 from tilestream.dataflow.simulate import SCENE_BYTES
 from tilestream.dataflow.simulate import simulate as simulate_city
 from tilestream.errors import (
+    LimitError,
     PartialError,
     PlanError,
     SourceNotFoundError,
@@ -50,6 +57,7 @@ from tilestream.formats import describe
 from tilestream.formats.mcap import ScanSelection
 from tilestream.formats.routes import read_routes
 from tilestream.records import TruePose
+from tilestream.report import exceeds
 from tilestream.sensors import SENSORS, Sensor
 from tilestream.simulation.settings import load_preset
 from tilestream.store import POINTS, TileStore, open_store
@@ -72,6 +80,7 @@ EVERY = typer.Option(min=1, help="Use every n-th scan of a log …")
 OFFSET = typer.Option(min=0, help="… from this one on: another offset uses other scans.")
 FROM_S = typer.Option(help="Use the scans of a log from this time on [s after its first].")
 UNTIL_S = typer.Option(help="Use the scans of a log before this time [s after its first].")
+JOB_WORKERS = typer.Option(min=1, help="Worker processes; default: one per core; 1: none.")
 MEMORY = typer.Option(help="What one task may use, e.g. 512MB or 2GB.")
 
 
@@ -386,6 +395,76 @@ def simulate(
         )
     out.print(f"{city}, preset {settings.preset}: {settings.note}", highlight=False)
     out.print(f"The map is in {made}/survey, the drives are in {made}/logs", highlight=False)
+
+
+@app.command("run")
+def run_job(
+    config: Annotated[str, typer.Argument(help="A YAML file; pipelines/city.yaml explains it.")],
+    changes: Annotated[
+        list[str], typer.Option("--set", help="key=value over the file, e.g. model.seed=1.")
+    ] = [],  # noqa: B006 - typer's way to say none
+    scheduler: Annotated[str | None, SCHEDULER] = None,
+    workers: Annotated[int | None, JOB_WORKERS] = None,
+    fail_over: Annotated[
+        float | None, typer.Option(help="Exit with 1 if any estimate is above this [m].")
+    ] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="As `plan`.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="For machines.")] = False,
+) -> None:
+    """The main job: from map and drives to the estimated error everywhere, and its report."""
+    if dry_run:
+        plan_job(config, changes, as_json=as_json)
+        return
+    settings = read_settings(config, changes)
+    with dask_client(scheduler, workers, settings.memory) as client, progress() as watch:
+        if client is not None:
+            err.print(f"Dask dashboard: {client.dashboard_link}", highlight=False, soft_wrap=True)
+        folder = main_job.run(settings, client, watch)
+    report = json.loads((folder / "report" / "report.json").read_text())
+    if as_json:
+        print_json(report)
+    else:
+        out.print(report_table(report))
+        page = (folder / "report" / "index.html").absolute()
+        out.print(f"The report is at {page}", highlight=False, soft_wrap=True)
+    if fail_over is not None:
+        judge_over(folder, fail_over)
+
+
+def judge_over(folder: Path, limit: float) -> None:
+    """Fail where the estimated error is too large: a gate for a map release.
+
+    Raises:
+        LimitError: an estimate is above the limit; says how many and the worst.
+    """
+    places = pd.read_csv(folder / "report" / "places.csv")
+    if exceeds(places, limit):
+        over = places[places["estimate"] > limit].nlargest(1, "estimate")
+        count = int((places["estimate"] > limit).sum())
+        where = [
+            f"{r.estimate:.2f} m on {r.route_id} at {r.arc_length:.0f} m" for r in over.itertuples()
+        ]
+        raise LimitError(
+            f"{count} of {len(places)} sample points are estimated above {limit:g} m, the worst "
+            f"{''.join(where)}"
+        )
+
+
+@app.command("plan")
+def plan_job(
+    config: Annotated[str, typer.Argument(help="A YAML file, as for `run`.")],
+    changes: Annotated[list[str], typer.Option("--set", help="key=value over the file.")] = [],  # noqa: B006
+    as_json: Annotated[bool, typer.Option("--json", help="For machines.")] = False,
+) -> None:
+    """What a job would run: stages, tasks, memory, core-hours; reads headers, writes nothing."""
+    expected = forecast(read_settings(config, changes))
+    rows = forecast_rows(expected)
+    if as_json:
+        print_json({"stages": rows, "notes": list(expected.notes)})
+        return
+    out.print(forecast_table(rows))
+    for note in expected.notes:
+        out.print(note, highlight=False, soft_wrap=True)
 
 
 @app.command()

@@ -1,11 +1,14 @@
 """What the commands print: facts as tables for people, as plain values for machines."""
 
 import math
+from typing import Any
 
 import pandas as pd
 from rich.box import SIMPLE
 from rich.table import Table
 
+from tilestream.dataflow.calibration import core_hours
+from tilestream.dataflow.main_plan import Forecast
 from tilestream.dataflow.plan import Plan, megabytes
 from tilestream.factors.catalogue import COLUMNS
 from tilestream.formats.base import SourceInfo
@@ -36,6 +39,48 @@ def plan_table(plan: Plan) -> Table:
         table.add_column(column, justify="left" if column == "stage" else "right")
     for stage, count, promise in plan.describe():
         table.add_row(stage, str(count), megabytes(promise))
+    return table
+
+
+def forecast_rows(expected: Forecast) -> list[dict[str, object]]:
+    """Stages of a job: tasks, the largest promise of any task, needs, estimated core-hours."""
+    hours = core_hours(expected.tasks)
+    stages = {task.key: task.stage for task in expected.tasks}
+    rows: list[dict[str, object]] = []
+    for stage in dict.fromkeys(task.stage for task in expected.tasks):
+        tasks = [task for task in expected.tasks if task.stage == stage]
+        after = {stages[need] for task in tasks for need in task.needs if need in stages}
+        rows.append(
+            {
+                "stage": stage,
+                "tasks": len(tasks),
+                "work": sum(task.work for task in tasks),
+                "after": sorted(after - {stage}),
+                "promised_bytes": max(task.promised_bytes for task in tasks),
+                "core_hours": round(hours[stage], 4),
+            }
+        )
+    return rows
+
+
+def forecast_table(rows: list[dict[str, object]]) -> Table:
+    """The same for people."""
+    table = Table(title="plan", title_justify="left", box=SIMPLE)
+    table.add_column("stage")
+    for column in ("tasks", "work", "memory per task", "core-hours"):
+        table.add_column(column, justify="right")
+    table.add_column("after")
+    for row in rows:
+        after = ", ".join(row["after"]) if isinstance(row["after"], list) else ""
+        memory = megabytes(int(str(row["promised_bytes"])))
+        hours = f"{float(str(row['core_hours'])):.3f}"
+        table.add_row(
+            str(row["stage"]), str(row["tasks"]), f"{row['work']:,}", memory, hours, after
+        )
+    total = sum(float(str(row["core_hours"])) for row in rows)
+    table.add_row(
+        "all", str(sum(int(str(row["tasks"])) for row in rows)), "", "", f"{total:.3f}", ""
+    )
     return table
 
 
@@ -106,4 +151,18 @@ def error_table(labels: pd.DataFrame) -> Table:
     for row in labels.nlargest(3, "error_mean").itertuples():
         place = f"worst: scan {row.scan} at {row.arc_length:.0f} m, ({row.x:.1f}, {row.y:.1f})"
         table.add_row(place, f"{row.error_mean:.4g} m")
+    return table
+
+
+def report_table(report: dict[str, Any]) -> Table:
+    """The headline of a report, and its worst places."""
+    table = Table(title=str(report["title"]), title_justify="left", box=SIMPLE)
+    table.add_column("fact")
+    table.add_column("value", justify="right")
+    for name, value in report["headline"].items():
+        if isinstance(value, int | float):
+            table.add_row(name, f"{value:.4g}" if isinstance(value, float) else f"{value:,}")
+    for worst in report["worst"][:3]:
+        where = f"worst: {worst['route_id']} at {worst['arc_length']:.0f} m"
+        table.add_row(where, f"{worst['estimate']:.3g} m")
     return table

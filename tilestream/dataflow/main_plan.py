@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from tilestream.config import IngestSettings
 from tilestream.dataflow.estimate_tasks import (
     JOIN_VERSION,
@@ -20,7 +22,8 @@ from tilestream.dataflow.estimate_tasks import (
 )
 from tilestream.dataflow.factors_route import plan_factors
 from tilestream.dataflow.factors_tasks import FactorsTask, Looking
-from tilestream.dataflow.ingest_map import SourcesRead, read_sources
+from tilestream.dataflow.ingest_map import SourcesRead, plan_ingest, read_sources
+from tilestream.dataflow.ingest_tasks import ScatterTask
 from tilestream.dataflow.localize_drive import plan_localize
 from tilestream.dataflow.localize_tasks import LabelTask, Reading
 from tilestream.dataflow.plan import Plan, Task
@@ -28,17 +31,18 @@ from tilestream.dataflow.run import Watch
 from tilestream.dataflow.run_settings import DriveSettings, RunSettings
 from tilestream.dataflow.simulate import simulate
 from tilestream.dataflow.tasks import Outcome
-from tilestream.errors import SourceNotFoundError, UsageError
+from tilestream.errors import SourceNotFoundError, StoreNotFoundError, UsageError
 from tilestream.factors.catalogue import COLUMNS
 from tilestream.forest.dataset import features_of, made_with
 from tilestream.forest.evaluation import factor_sets
 from tilestream.forest.models import COMPETITORS, FORESTS, OPPONENTS
+from tilestream.formats import describe
 from tilestream.formats.mcap import ScanSelection
 from tilestream.formats.routes import read_routes
 from tilestream.records import Route
 from tilestream.simulation.settings import load_preset
-from tilestream.store import TileStore, hash_of, open_store
-from tilestream.tiling import TileKey
+from tilestream.store import StoreSettings, TileStore, hash_of, open_store
+from tilestream.tiling import MM_PER_M, Box, TileKey
 from tilestream.version import VERSION
 
 MAIN = "error_mean"
@@ -132,20 +136,38 @@ def read_map(
     """
     if not inputs.sources:
         return SourcesRead(open_store(settings.store_url), (), Plan((), settings.memory))
-    names = set(IngestSettings.model_fields)
-    ingest = IngestSettings(**settings.map.model_dump(include=names))
-    logs = any(source.lower().endswith(".mcap") for source in inputs.sources)
     return read_sources(
         inputs.sources,
         settings.store_url,
-        ingest,
+        ingest_settings(settings),
         client=client,
         memory=settings.memory,
         watch=watch,
         points_topic=settings.map.points_topic,
         pose_topic=settings.map.pose_topic,
-        scans=ScanSelection(every=settings.map.every, offset=settings.map.offset) if logs else None,
+        scans=map_scans(settings, inputs),
     )
+
+
+def ingest_settings(settings: RunSettings) -> IngestSettings:
+    """How the map is cut into tiles."""
+    names = set(IngestSettings.model_fields)
+    return IngestSettings(**settings.map.model_dump(include=names))
+
+
+def map_scans(settings: RunSettings, inputs: Inputs) -> ScanSelection | None:
+    """Which scans of logs become the map; None: there are no logs among the sources."""
+    if any(source.lower().endswith(".mcap") for source in inputs.sources):
+        return ScanSelection(every=settings.map.every, offset=settings.map.offset)
+    return None
+
+
+def is_simulated(settings: RunSettings) -> bool:
+    """Whether the simulated city is there, every drive of it."""
+    assert settings.simulate is not None
+    folder = simulated_folder(settings)
+    drives = [folder / "logs" / f"drive{drive}" for drive in range(settings.simulate.drives)]
+    return (folder / "routes.geojson").exists() and all(any(d.glob("*.mcap")) for d in drives)
 
 
 def plan_measure(
@@ -293,3 +315,75 @@ def judges(join: JoinTask, folder: str, seed: int) -> list[Task]:
     ]
     weigh = hash_of(join.identity, seed, TRAIN_VERSION, VERSION)
     return [*tasks, WeighTask(join.out, seed, f"{folder}/weights.parquet", weigh)]
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """What a job would do, told before it does anything."""
+
+    tasks: tuple[Task, ...]
+    """The tasks, each after those that it needs; of the map's tiles, those that there may be."""
+    notes: tuple[str, ...]
+    """What is not known before the job runs."""
+
+
+def forecast(settings: RunSettings) -> Forecast:
+    """What the main job would run; nothing is read beyond headers, nothing is written.
+
+    Raises:
+        PlanError: a task does not fit `memory`.
+        UsageError, SourceError, StoreError: as the job itself.
+    """
+    if settings.simulate is not None and not is_simulated(settings):
+        return Forecast(
+            (), (f"first the city is simulated in {simulated_folder(settings)}; then plan again",)
+        )
+    inputs = inputs_of(settings, None, None)
+    store, reading, have, notes = _expected_map(settings, inputs)
+    measure = plan_measure(settings, inputs, store, (), have)
+    done = [Outcome(task.key, task.stage, None) for task in measure.tasks]
+    estimate = plan_estimate(settings, measure, done)
+    return Forecast((*reading, *measure.tasks, *estimate.tasks), tuple(notes))
+
+
+def _expected_map(
+    settings: RunSettings, inputs: Inputs
+) -> tuple[TileStore, tuple[Task, ...], dict[TileKey, str], list[str]]:
+    """The store as it is, or as the bounds of its sources let expect it."""
+    try:
+        store = open_store(settings.store_url)
+    except StoreNotFoundError:
+        if not inputs.sources:
+            raise
+    else:
+        if store.sources():
+            return (
+                store,
+                (),
+                store.identities(),
+                ["the map is there; changed sources are read again"],
+            )
+    plan = plan_ingest(
+        inputs.sources,
+        settings.store_url,
+        ingest_settings(settings),
+        settings.memory,
+        settings.map.points_topic,
+        settings.map.pose_topic,
+        map_scans(settings, inputs),
+    )
+    store = TileStore(settings.store_url, StoreSettings(**ingest_settings(settings).model_dump()))
+    have: dict[TileKey, str] = {}
+    unknown: list[str] = []
+    for path in sorted({task.source for task in plan.tasks if isinstance(task, ScatterTask)}):
+        bounds = describe(path).bounds
+        if bounds is None:
+            unknown.append(path)
+        else:
+            low, high = (np.round(np.array(corner) * MM_PER_M).astype(int) for corner in bounds)
+            box = Box(int(low[0]), int(low[1]), int(high[0]) + 1, int(high[1]) + 1)
+            have |= dict.fromkeys(store.grid.keys_over(box), "expected")
+    notes = [f"at most {len(have)} tiles, by the bounds of the sources; reading tells which"]
+    if unknown:
+        notes.append(f"only reading tells where the points of {', '.join(unknown[:3])} are")
+    return store, plan.tasks, have, notes
