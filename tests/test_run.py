@@ -1,17 +1,31 @@
 """The engine: needs before tasks, refusals that travel, the same outcomes here and on Dask."""
 
+import itertools
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections import Counter
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
+import dask
 import distributed
+import psutil
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from naps import Nap
 
 from tilestream.dataflow.plan import Plan
-from tilestream.dataflow.run import dask_client, execute
+from tilestream.dataflow.run import TlsFiles, dask_client, execute, report_kept
 from tilestream.dataflow.tasks import Outcome, perform
-from tilestream.errors import PlanError, TilestreamError
+from tilestream.errors import PlanError, TaskError, TilestreamError, UsageError
+from tilestream.tiling import TileKey
 
 
 @dataclass(frozen=True)
@@ -76,26 +90,21 @@ def test_what_needs_a_failure_is_refused_and_all_else_runs_after_its_needs(
 
 
 @pytest.fixture(scope="module")
-def client() -> Iterator[distributed.Client]:
-    with (
-        distributed.LocalCluster(
-            n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None
-        ) as cluster,
-        distributed.Client(cluster) as client,
-    ):
+def workers() -> Iterator[distributed.Client]:
+    with dask_client(None, 2, 10**9) as client:
         yield client
 
 
-def test_dask_gives_the_same_outcomes_in_the_same_order(client: distributed.Client) -> None:
+def test_dask_gives_the_same_outcomes_in_the_same_order(workers: distributed.Client) -> None:
     tasks = graph([[], [0], [], [1, 2], [3], [0], [5, 4]] + [[n] for n in range(40)], {2, 20})
     here = execute(tasks, None, None)
     seen: list[Outcome] = []
-    there = execute(tasks, client, lambda outcome, *_: seen.append(outcome))
+    there = execute(tasks, workers, lambda outcome, *_: seen.append(outcome))
     assert [(o.key, o.result, o.reason) for o in there] == [
         (o.key, o.result, o.reason) for o in here
     ]
     assert len(seen) == len(tasks)
-    again = execute([Sum(0, error="odd")], client, None)
+    again = execute([Sum(0, error="odd")], workers, None)
     assert again[0].reason == "ZeroDivisionError: odd"
     assert "Traceback" in again[0].details
 
@@ -118,3 +127,266 @@ def test_a_plan_names_the_task_that_does_not_fit() -> None:
     assert list(plan.describe()) == [("sum", 2, 2 * 10**9)]
     with pytest.raises(PlanError, match=r"sum-1 needs 2,000 MB and may use 1,000 MB"):
         plan.check()
+
+
+@pytest.mark.parametrize(
+    ("how", "failures", "runs", "reason"),
+    [
+        ("disk", 2, 3, ""),
+        ("disk", 9, 3, "[Errno 28] No space left on device (OSError) (tried 3 times)"),
+        ("memory", 1, 2, ""),
+        ("no such tile", 1, 1, "no such tile"),
+        ("bug", 1, 1, "ZeroDivisionError: bug"),
+    ],
+)
+def test_what_may_pass_is_tried_again_and_a_verdict_stands(
+    how: str, failures: int, runs: int, reason: str, tmp_path: Path
+) -> None:
+    nap = Nap(TileKey(0, 0), failures=failures, how=how, notes=str(tmp_path))
+    after = Nap(TileKey(0, 0), "after", needs=(nap.key,))
+    other = Nap(TileKey(1, 0))
+    first, second, third = execute([nap, after, other], None, None, retries=2)
+    assert len(list(tmp_path.iterdir())) == runs
+    assert first.reason == reason
+    assert second.reason == (f"not run, since {nap.key} failed: {reason}" if reason else "")
+    assert third.ok
+
+
+def test_a_tile_goes_through_all_stages_before_the_last_one_has_begun() -> None:
+    tiles = [TileKey(i, 0) for i in range(50)]
+    stages = [
+        Nap(tile, stage, needs=(f"{before}-{tile}",) if before else ())
+        for before, stage in itertools.pairwise(("", "cells", "terms", "factors"))
+        for tile in tiles
+    ]
+    order: list[str] = []
+    execute(stages, None, lambda outcome, *_: order.append(outcome.key))
+    assert order[:3] == ["cells-0_0", "terms-0_0", "factors-0_0"]
+    assert len(order) == len(set(order)) == 150
+
+
+def test_a_long_chain_of_refusals_is_no_recursion() -> None:
+    chain = [Nap(TileKey(0, 0), notes="/nowhere/at/all", how="bug")]
+    chain += [Nap(TileKey(i, 0), needs=(f"nap-{i - 1}_0",)) for i in range(1, 5000)]
+    outcomes = execute(chain, None, None)
+    assert sum(outcome.ok for outcome in outcomes) == 0
+    assert outcomes[-1].reason.startswith("not run, since nap-0_0 failed: [Errno 2]")
+
+
+def test_a_local_cluster_listens_on_loopback_alone(workers: distributed.Client) -> None:
+    assert workers.dashboard_link.startswith("http://127.0.0.1:")
+    sockets = psutil.Process().net_connections("tcp")
+    for child in psutil.Process().children(recursive=True):
+        sockets += child.net_connections("tcp")
+    heard = {socket.laddr.ip for socket in sockets if socket.status == psutil.CONN_LISTEN}
+    assert heard == {"127.0.0.1"}
+
+
+def test_a_worker_is_one_thread_with_a_limit(workers: distributed.Client) -> None:
+    names = [f"{library}_NUM_THREADS" for library in ("NUMBA", "OPENBLAS", "OMP", "MKL")]
+    found = workers.run(lambda: [os.environ.get(name) for name in names])
+    assert list(found.values()) == [["1"] * 4] * 2
+    assert list(workers.nthreads().values()) == [1, 1]
+    limits = [w["memory_limit"] for w in workers.scheduler_info()["workers"].values()]
+    assert limits == [2 * 10**9] * 2
+
+
+def test_a_killed_worker_is_replaced_and_its_task_done(
+    workers: distributed.Client, tmp_path: Path
+) -> None:
+    naps = [Nap(TileKey(i, 0)) for i in range(20)]
+    naps[3] = Nap(TileKey(3, 0), failures=1, how="killed", notes=str(tmp_path))
+    outcomes = execute(naps, workers, None)
+    assert [o.result for o in outcomes] == [f"{i}_0" for i in range(20)]
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_each_stage_is_one_span_and_keys_name_stage_and_tile(workers: distributed.Client) -> None:
+    keys: list[str] = []
+
+    class Keys(distributed.SchedulerPlugin):
+        def transition(self, key: str, *args: Any, **kwargs: Any) -> None:  # noqa: ARG002
+            keys.append(key)
+
+    scheduler = workers.cluster.scheduler
+    scheduler.add_plugin(Keys(), name="keys")
+    before = set(scheduler.extensions["spans"].spans)
+    execute([Nap(TileKey(i, -1), s) for s in ("spa", "spb") for i in range(9)], workers, None)
+    scheduler.remove_plugin("keys")
+    spans = scheduler.extensions["spans"].spans
+    named = Counter(spans[key].name for key in spans if key not in before)
+    assert named[("tilestream", "spa")] == named[("tilestream", "spb")] == 1
+    assert {key.split("-")[0] for key in keys} == {"spa", "spb"}
+    assert {key.split("-", 2)[2] for key in keys} == {f"{i}_-1" for i in range(9)}
+    assert len(scheduler.task_prefixes["spa"].groups) <= 1
+
+
+def test_a_report_is_kept_and_a_lost_scheduler_does_not_hide_the_reason(
+    workers: distributed.Client, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with report_kept(workers, tmp_path / "dask.html"):
+        execute([Nap(TileKey(0, 0))], workers, None)
+    assert "<html" in (tmp_path / "dask.html").read_text()[:200]
+    impossible = tmp_path / "dask.html" / "below-a-file.html"
+    with pytest.raises(ZeroDivisionError), report_kept(workers, impossible):
+        raise ZeroDivisionError
+    assert f"no Dask performance report at {impossible}" in caplog.text
+    with report_kept(None, tmp_path / "none.html"):
+        pass
+    assert not (tmp_path / "none.html").exists()
+
+
+def test_another_address_than_loopback_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
+    with dask_client(None, 2, 10**9, host="127.0.0.2") as client:
+        assert client is not None
+        assert "127.0.0.2" in client.scheduler.address
+    assert "whoever reaches them can run code here" in caplog.text
+
+
+def test_workers_print_nothing(tmp_path: Path) -> None:
+    script = tmp_path / "quiet.py"
+    script.write_text(QUIET.format(tests=str(Path(__file__).parent)))
+    environment = {**os.environ, "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
+    command = [sys.executable, script]
+    told = subprocess.run(command, check=True, capture_output=True, text=True, env=environment)
+    assert told.stdout == "3 of 4\n"
+    assert told.stderr == ""
+
+
+QUIET = """
+import sys
+sys.path.insert(0, {tests!r})
+from naps import Nap
+from tilestream.dataflow.run import dask_client, execute
+from tilestream.tiling import TileKey
+
+if __name__ == "__main__":
+    naps = [Nap(TileKey(i, 0)) for i in range(3)]
+    naps.append(Nap(TileKey(3, 0), how="killed", failures=9, notes=sys.path[1]))
+    with dask_client(None, 2, 10**9) as client:
+        outcomes = execute(naps, client, None, retries=1)
+    print(sum(outcome.ok for outcome in outcomes), "of", len(outcomes))
+"""
+
+
+@contextmanager
+def scheduler_elsewhere(
+    workers: int, *flags: str
+) -> Iterator[tuple[str, list["subprocess.Popen[bytes]"]]]:
+    """Address and processes of a scheduler in another process, and of its workers."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    protocol = "tls" if flags else "tcp"
+    address = f"{protocol}://127.0.0.1:{port}"
+    common = ["--host", "127.0.0.1", *flags]
+    program = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
+    commands = [[*program, *common, "--port", str(port), "--dashboard-address", "127.0.0.1:0"]]
+    program = [sys.executable, "-m", "distributed.cli.dask_worker"]
+    one = ["--nthreads", "1", "--no-dashboard"]
+    commands += [[*program, address, *common, *one]] * workers
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    processes = [
+        subprocess.Popen(
+            command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        for command in commands
+    ]
+    try:
+        yield address, processes
+    finally:
+        for process in reversed(processes):
+            process.kill()
+            process.wait(20)
+
+
+def test_a_scheduler_in_another_process_and_its_loss() -> None:
+    with scheduler_elsewhere(1) as (address, processes), dask_client(address, None, 1) as client:
+        naps = [Nap(TileKey(i, 0)) for i in range(10)]
+        assert all(outcome.ok for outcome in execute(naps, client, None))
+
+        def kill(outcome: Outcome, ended: int, total: int) -> None:
+            if ended == 3:
+                processes[0].kill()
+
+        naps = [Nap(TileKey(i, 0), seconds=0.05) for i in range(200)]
+        with pytest.raises(TaskError, match=rf"{address} is gone: run the same command again"):
+            execute(naps, client, kill)
+
+
+def test_a_scheduler_without_workers_is_given_up() -> None:
+    with (
+        scheduler_elsewhere(0) as (address, _),
+        dask_client(address, None, 1) as client,
+        pytest.raises(TaskError, match=r"has had no worker for 1 s: start workers"),
+    ):
+        execute([Nap(TileKey(0, 0))], client, None, patience=1.0)
+
+
+def test_a_run_waits_for_what_a_killed_client_left_behind(tmp_path: Path) -> None:
+    script = tmp_path / "killed.py"
+    notes = tmp_path / "notes"
+    notes.mkdir()
+    script.write_text(KILLED.format(tests=str(Path(__file__).parent)))
+    with scheduler_elsewhere(1) as (address, _):
+        first = subprocess.Popen([sys.executable, script, address, tmp_path / "notes"])
+        until = time.monotonic() + 60.0
+        while not list(notes.glob("nap-*")):
+            assert time.monotonic() < until
+            time.sleep(0.05)
+        first.kill()
+        first.wait()
+        began = time.time_ns()
+        with dask_client(address, None, 1) as client:
+            execute([Nap(TileKey(1, 0), notes=str(notes))], client, None)
+        (left,) = notes.glob("nap-0_0-*")
+        (right,) = notes.glob("nap-1_0-*")
+        ends = int(left.name.rsplit("-", 1)[1]) + 3 * 10**9
+        assert began < ends < int(right.name.rsplit("-", 1)[1])
+
+
+KILLED = """
+import sys
+sys.path.insert(0, {tests!r})
+from naps import Nap
+from tilestream.dataflow.run import dask_client, execute
+from tilestream.tiling import TileKey
+
+with dask_client(sys.argv[1], None, 1) as client:
+    execute([Nap(TileKey(0, 0), after=3.0, notes=sys.argv[2])], client, None)
+"""
+
+
+def test_certificates_are_passed_through(tmp_path: Path) -> None:
+    made = distributed.Security.temporary()
+    paths = {name: tmp_path / f"{name}.pem" for name in ("ca", "cert", "key")}
+    paths["ca"].write_text(made.tls_ca_file)
+    paths["cert"].write_text(made.tls_scheduler_cert)
+    paths["key"].write_text(made.tls_scheduler_key)
+    ca, cert, key = (str(path) for path in paths.values())
+    flags = ("--tls-ca-file", ca, "--tls-cert", cert, "--tls-key", key)
+    with scheduler_elsewhere(1, *flags) as (address, _):
+        with dask_client(address, None, 1, tls=TlsFiles(ca, cert, key)) as client:
+            assert execute([Nap(TileKey(0, 0))], client, None)[0].result == "0_0"
+        with (
+            pytest.raises(UsageError, match=r"perhaps check your TLS configuration"),
+            dask_client(address, None, 1),
+        ):
+            pass
+
+
+def test_nobody_answers() -> None:
+    with (
+        dask.config.set({"distributed.comm.timeouts.connect": "500ms"}),
+        pytest.raises(TaskError, match=r"no Dask scheduler answers at tcp://127.0.0.1:9"),
+        dask_client("tcp://127.0.0.1:9", None, 1),
+    ):
+        pass
+
+
+def test_an_address_that_is_none() -> None:
+    with (
+        pytest.raises(UsageError, match="'no where' is no scheduler"),
+        dask_client("no where", 1, 1),
+    ):
+        pass

@@ -1,37 +1,81 @@
 """How tasks run: one by one in this process, or on Dask, with the same outcomes."""
 
+import logging
+import os
+import queue
+import time
 import uuid
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import distributed
+from dask.base import annotate, get_annotations
+from dask.system import CPU_COUNT
+from distributed.comm.core import CommClosedError
+from distributed.utils import silence_logging_cmgr
 
-from tilestream.dataflow.plan import Task
+from tilestream.dataflow.plan import Task, megabytes
 from tilestream.dataflow.tasks import Outcome, attempt
+from tilestream.errors import TaskError, UsageError
 
+logger = logging.getLogger(__name__)
+
+RETRIES = 2
+"""How often a task is tried again whose failure may be passing."""
+PATIENCE = 600.0
+"""How long a scheduler may be without any worker before the run is given up [s]."""
 IN_FLIGHT_PER_THREAD = 4
 """Tasks handed to Dask at a time, per thread of its workers."""
+LOOK_EVERY = 2.0
+"""How often the scheduler is asked for its workers [s]."""
+ANSWER_WITHIN = 30.0
+"""How long a scheduler may take to answer before it is taken for lost [s]."""
+RESULT_WITHIN = 5.0
+"""How long a result of a task that has ended is waited for before a look at the scheduler [s]."""
+OURS = "ts0"
+"""How the part of a Dask key begins that names the run."""
+LOOPBACK = "127.0.0.1"
+ONE_THREAD = {
+    f"{library}_NUM_THREADS": "1" for library in ("NUMBA", "OPENBLAS", "OMP", "MKL", "VECLIB")
+}
+"""Environment of a worker: its process is its one thread."""
 
 Watch = Callable[[Outcome, int, int], None]
 """Called after each task: its outcome, how much of its stage has ended, how much that is in all
 (in what the stage counts: tiles, scans, points)."""
 
 
-def execute(tasks: Sequence[Task], client: Any | None, watch: Watch | None) -> list[Outcome]:
+def execute(
+    tasks: Sequence[Task],
+    client: Any | None,
+    watch: Watch | None,
+    *,
+    retries: int = RETRIES,
+    patience: float = PATIENCE,
+) -> list[Outcome]:
     """Run tasks, each as soon as those that it needs are done.
 
-    A task whose need failed is not run: its outcome says which need and why. Everything else is
-    finished.
+    A task that failed for a passing reason (a lost worker, the disk, the network, memory) is tried
+    again after the others. A task whose need failed is not run: its outcome says which need and
+    why. Everything else is finished.
 
     Args:
         tasks: each after the tasks that it needs; a need that is not among them counts as done.
         client: a Dask client; None: one by one in this process.
         watch: is told of each outcome.
+        retries: how often a task is tried again.
+        patience: how long to wait for a worker while the scheduler has none [s].
 
     Returns:
         The outcomes in the order of the tasks, whatever the order in which they ended.
+
+    Raises:
+        TaskError: the scheduler was lost, or has had no worker for too long. What is done is
+            marked: the same command continues.
     """
     ended: dict[str, Outcome] = {}
     work = {task.key: task.work for task in tasks}
@@ -39,8 +83,9 @@ def execute(tasks: Sequence[Task], client: Any | None, watch: Watch | None) -> l
     done: Counter[str] = Counter()
     for task in tasks:
         total[task.stage] += task.work
-    frontier = Frontier(tasks)
-    for outcome in _run_here(frontier) if client is None else _run_on_dask(frontier, client):
+    frontier = Frontier(tasks, retries)
+    running = _run_here(frontier) if client is None else _run_on_dask(frontier, client, patience)
+    for outcome in running:
         ended[outcome.key] = outcome
         done[outcome.stage] += work[outcome.key]
         if watch is not None:
@@ -49,107 +94,357 @@ def execute(tasks: Sequence[Task], client: Any | None, watch: Watch | None) -> l
 
 
 class Frontier:
-    """The tasks that may run now, in their order, as outcomes come in."""
+    """The tasks that may run now, as outcomes come in.
 
-    def __init__(self, tasks: Sequence[Task]) -> None:
-        keys = {task.key for task in tasks}
+    What others wait for comes in the order of the plan; what has just become possible comes first,
+    so that a tile goes through all stages while its neighbourhood is at hand, and no stage waits
+    for the end of another.
+    """
+
+    def __init__(self, tasks: Sequence[Task], retries: int = RETRIES) -> None:
+        self._tasks = {task.key: task for task in tasks}
+        self._retries = retries
+        self._tries: Counter[str] = Counter()
         self._ready: deque[Task] = deque()
         self._open: dict[str, int] = {}
         self._after: dict[str, list[Task]] = {}
         for task in tasks:
-            needs = keys.intersection(task.needs)
-            self._open[task.key] = len(needs)
+            needs = self._tasks.keys() & set(task.needs)
+            if needs:
+                self._open[task.key] = len(needs)
+            else:
+                self._ready.append(task)
             for need in needs:
                 self._after.setdefault(need, []).append(task)
-            if not needs:
-                self._ready.append(task)
 
     def take(self) -> Task | None:
         """The next task that may run; None where none may until another one has ended."""
         return self._ready.popleft() if self._ready else None
 
+    def tries(self, key: str) -> int:
+        """How often a task has failed so far."""
+        return self._tries[key]
+
     def learn(self, outcome: Outcome) -> Iterator[Outcome]:
-        """Note an outcome; give those of the tasks that cannot run any more because of it."""
-        for task in self._after.pop(outcome.key, []):
-            if self._open[task.key] < 0:
-                continue
-            if outcome.ok:
-                self._open[task.key] -= 1
-                if self._open[task.key] == 0:
-                    self._ready.append(task)
+        """Note an outcome; give what is certain now.
+
+        That is the outcome itself, unless the task is to be tried again, and those of the tasks
+        that cannot run any more because of it.
+        """
+        if outcome.passing and self._tries[outcome.key] < self._retries:
+            self._tries[outcome.key] += 1
+            self._ready.append(self._tasks[outcome.key])
+            return
+        if outcome.passing:
+            reason = f"{outcome.reason} (tried {1 + self._tries[outcome.key]} times)"
+            outcome = replace(outcome, reason=reason)
+        certain = deque([outcome])
+        while certain:
+            known = certain.popleft()
+            after = self._after.pop(known.key, [])
+            if known.ok:
+                self._ready.extendleft(reversed([task for task in after if self._free(task)]))
             else:
-                self._open[task.key] = -1
-                reason = f"not run, since {outcome.key} failed: {outcome.reason}"
-                refused = Outcome(task.key, task.stage, None, reason)
-                yield refused
-                yield from self.learn(refused)
+                certain.extend(self._refuse(task, known) for task in after if self._drop(task))
+            yield known
+
+    def _free(self, task: Task) -> bool:
+        """Whether the last open need of a task has just been met."""
+        left = self._open.get(task.key, 0) - 1
+        if left > 0:
+            self._open[task.key] = left
+        return left == 0 and self._drop(task)
+
+    def _drop(self, task: Task) -> bool:
+        """Whether a task was still waiting; it does not wait any more."""
+        return self._open.pop(task.key, None) is not None
+
+    def _refuse(self, task: Task, need: Outcome) -> Outcome:
+        reason = need.reason
+        if not reason.startswith("not run, since "):
+            reason = f"not run, since {need.key} failed: {reason}"
+        return Outcome(task.key, task.stage, None, reason)
 
 
 def _run_here(frontier: Frontier) -> Iterator[Outcome]:
     while (task := frontier.take()) is not None:
-        outcome = attempt(task)
-        yield outcome
-        yield from frontier.learn(outcome)
+        yield from frontier.learn(attempt(task))
 
 
-def _run_on_dask(frontier: Frontier, client: Any) -> Iterator[Outcome]:
-    running = distributed.as_completed(loop=client.loop)
-    by_future: dict[str, Task] = {}
-    here = uuid.uuid4().hex[:8]  # so that two runs on one scheduler never share a key
+def _run_on_dask(frontier: Frontier, client: Any, patience: float) -> Iterator[Outcome]:
+    """As `_run_here`, with a bounded number of tasks at Dask at any time."""
+    workers = _Workers(client, patience)
+    workers.wait_for_orphans()
+    submit = _Submitter(client)
+    running: dict[str, tuple[Task, Any]] = {}
+    ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
     while True:
-        window = IN_FLIGHT_PER_THREAD * max(1, sum(client.nthreads().values()))
-        while len(by_future) < window and (task := frontier.take()) is not None:
-            stage, name = task.key.split("-", 1)
-            future = client.submit(attempt, task, key=f"{stage}-{here}-{name}")
-            by_future[future.key] = task
-            running.add(future)
-        if not by_future:
+        window = IN_FLIGHT_PER_THREAD * max(1, workers.threads())
+        while len(running) < window and (task := frontier.take()) is not None:
+            future = submit(task, frontier.tries(task.key))
+            running[future.key] = task, future
+            future.add_done_callback(ended.put)
+        if not running:
             return
-        future = next(running)
-        outcome = _outcome(by_future.pop(future.key), future)
-        future.release()
-        yield outcome
-        yield from frontier.learn(outcome)
+        batch = _drain(ended)
+        results = _gathered(batch, client)
+        for future in batch:
+            outcome = results.get(future.key) or _outcome(running[future.key][0], future, workers)
+            if outcome is None:
+                future.add_done_callback(ended.put)
+            else:
+                del running[future.key]
+                future.release()
+                yield from frontier.learn(outcome)
 
 
-def _outcome(task: Task, future: Any) -> Outcome:
-    """What became of a task on Dask; a worker that was lost too often is a failure too.
+def _drain(ended: "queue.SimpleQueue[Any]") -> list[Any]:
+    """What has ended by now; waits for the first a little."""
+    found = []
+    with suppress(queue.Empty):
+        found.append(ended.get(timeout=LOOK_EVERY))
+        while True:
+            found.append(ended.get_nowait())
+    return found
 
-    A result that was lost with its worker is waited for: Dask does the task again, which finds its
-    work marked as done.
+
+def _gathered(futures: Sequence[Any], client: Any) -> dict[str, Outcome]:
+    """The outcomes by Dask key of those futures that give one at once, in one request."""
+    whole = [future for future in futures if future.status == "finished"]
+    gather = partial(client.gather, whole, asynchronous=True)
+    try:
+        results = client.sync(gather, callback_timeout=RESULT_WITHIN)
+    except Exception:  # noqa: BLE001 - one of them was lost: each is asked for by itself
+        return {}
+    return dict(zip([future.key for future in whole], results, strict=True))
+
+
+class _Submitter:
+    """Hands tasks to Dask under readable keys, each stage in a span of its own."""
+
+    def __init__(self, client: Any) -> None:
+        self._client = client
+        self._run = f"{OURS}{uuid.uuid4().hex[:5]}"  # two runs on one scheduler share no key
+        self._spans: dict[str, Any] = {}
+
+    def __call__(self, task: Task, tries: int) -> Any:
+        """The future of a task that has failed `tries` times."""
+        if task.stage not in self._spans:
+            with distributed.span("tilestream", task.stage):
+                self._spans[task.stage] = get_annotations()["span"]
+        stage, name = task.key.split("-", 1)
+        key = f"{stage}-{self._run}-{name}" + (f"#{tries + 1}" if tries else "")
+        with annotate(span=self._spans[task.stage]):
+            return self._client.submit(attempt, task, key=key, pure=False)
+
+
+def _outcome(task: Task, future: Any, workers: "_Workers") -> Outcome | None:
+    """What became of a task on Dask; None where its result was lost and it runs once more.
+
+    A worker that was lost too often is a failure too, and may be passing: it may have died of
+    another task. A result that was lost with its worker is waited for: Dask does the task again,
+    which finds its work marked as done.
     """
     try:
-        outcome: Outcome = future.result()
+        outcome: Outcome = future.result(timeout=RESULT_WITHIN)
+    except TimeoutError:
+        workers.require_scheduler()
+        return None
     except Exception as error:  # noqa: BLE001 - `attempt` never raises, so this is Dask's own
-        return Outcome(task.key, task.stage, None, f"lost by Dask: {error or future.status}")
+        workers.require_scheduler()
+        reason = f"lost by Dask: {error or future.status}"
+        return Outcome(task.key, task.stage, None, reason, passing=True)
     return outcome
 
 
+class _Workers:
+    """The workers of a scheduler: how many threads they have, and whether anybody is there."""
+
+    def __init__(self, client: Any, patience: float) -> None:
+        self._client = client
+        self._patience = patience
+        self._address = client.scheduler.address
+        self._threads = 0
+        self._asked = -LOOK_EVERY
+        self._seen = time.monotonic()
+
+    def threads(self) -> int:
+        """Threads of all workers, at most a few seconds old.
+
+        Raises:
+            TaskError: the scheduler is lost, or has had no worker for longer than the patience.
+        """
+        now = time.monotonic()
+        if now - self._asked < LOOK_EVERY:
+            return self._threads
+        self.require_scheduler()
+        try:
+            found = self._client.sync(self._client.scheduler.ncores, callback_timeout=ANSWER_WITHIN)
+        except (OSError, TimeoutError, CommClosedError):
+            raise self._lost() from None
+        self._asked, self._threads = now, sum(found.values())
+        if self._threads:
+            self._seen = now
+        elif now - self._seen > self._patience:
+            raise TaskError(
+                f"the scheduler at {self._address} has had no worker for {self._patience:.0f} s: "
+                "start workers, then run the same command again; it continues where it was"
+            )
+        return self._threads
+
+    def require_scheduler(self) -> None:
+        """Refuse to go on without the scheduler.
+
+        Raises:
+            TaskError: the client has lost it.
+        """
+        if self._client.status != "running":
+            raise self._lost()
+
+    def wait_for_orphans(self) -> None:
+        """Wait until no worker is busy with a task of a run whose client is gone.
+
+        It cannot be stopped, and would write the same tile as this run does.
+        """
+        said = False
+        while True:
+            self.require_scheduler()
+            try:
+                found = self._client.run(_orphans, on_error="ignore")
+            except (OSError, TimeoutError, CommClosedError):
+                raise self._lost() from None
+            left = sorted(key for keys in found.values() for key in keys)
+            if not left:
+                return
+            if not said:
+                logger.info("waiting for %s of an earlier run to end", ", ".join(left))
+                said = True
+            time.sleep(0.2)
+
+    def _lost(self) -> TaskError:
+        return TaskError(
+            f"the Dask scheduler at {self._address} is gone: run the same command again, with a "
+            "scheduler that runs; what is done is marked, and it continues where it was"
+        )
+
+
+def _orphans(dask_worker: Any) -> list[str]:
+    """Keys of the tasks of ours that a worker still runs although nobody wants them any more."""
+    return [
+        str(task.key)
+        for task in dask_worker.state.executing
+        if task.state == "cancelled" and f"-{OURS}" in str(task.key)
+    ]
+
+
+@dataclass(frozen=True)
+class TlsFiles:
+    """The certificates that client, scheduler and workers know each other by (PEM)."""
+
+    ca: str
+    """Path of the certificate of the authority that signed the others."""
+    cert: str
+    """Path of this cluster's certificate."""
+    key: str
+    """Path of its private key."""
+
+    def security(self) -> Any:
+        """As Dask takes them; nothing unencrypted is let in."""
+        roles = ("client", "scheduler", "worker")
+        named = {f"tls_{role}_cert": self.cert for role in roles}
+        named |= {f"tls_{role}_key": self.key for role in roles}
+        return distributed.Security(tls_ca_file=self.ca, require_encryption=True, **named)
+
+
 @contextmanager
-def dask_client(scheduler: str | None, workers: int, memory: int) -> Iterator[Any | None]:
+def dask_client(
+    scheduler: str | None,
+    workers: int | None,
+    memory: int,
+    *,
+    host: str = LOOPBACK,
+    tls: TlsFiles | None = None,
+) -> Iterator[Any | None]:
     """A Dask client, or None where the tasks run in this process.
 
     Args:
-        scheduler: address of a running scheduler, e.g. `tcp://10.0.0.1:8786`; None: a local one.
-        workers: worker processes of the local cluster, one thread each, listening on loopback
-            only; 1 without a scheduler: no cluster, this process does the work.
-        memory: what a worker may use before Dask restarts it [bytes], twice the tasks' promise.
+        scheduler: address of a running scheduler, e.g. `tcp://10.0.0.1:8786` or `tls://…`; None: a
+            local one.
+        workers: worker processes of the local cluster, one thread each; None: one per core; 1
+            without a scheduler: no cluster, this process does the work.
+        memory: what a task may use [bytes]. A worker of the local cluster is restarted when it
+            comes near twice that: a broken promise ends in a reason, not in a machine that swaps.
+        host: address that the local scheduler and its dashboard listen on.
+        tls: certificates; None: as Dask's own configuration says (`distributed.comm.tls`).
+
+    Raises:
+        TaskError: nobody answers at the scheduler's address.
+        UsageError: the scheduler's address is none.
     """
+    security = None if tls is None else tls.security()
+    count = CPU_COUNT if workers is None else workers
     if scheduler is not None:
-        with distributed.Client(scheduler) as client:
+        with silence_logging_cmgr(logging.CRITICAL), _connected(scheduler, security) as client:
             yield client
-    elif workers > 1:
+    elif count > 1:
+        if host != LOOPBACK:
+            logger.warning(
+                "scheduler and dashboard listen on %s: whoever reaches them can run code here; "
+                "use TLS, or a network that you trust",
+                host,
+            )
         with (
             distributed.LocalCluster(
-                n_workers=workers,
+                n_workers=count,
                 threads_per_worker=1,
                 memory_limit=2 * memory,
-                host="127.0.0.1",
-                dashboard_address="127.0.0.1:0",
-                env={"NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+                host=host,
+                dashboard_address=f"{host}:0",
+                protocol="tcp://" if tls is None else "tls://",
+                security=security,
+                silence_logs=logging.CRITICAL,  # what failed is told once, by the outcomes
+                env=ONE_THREAD,
             ) as cluster,
             distributed.Client(cluster) as client,
         ):
+            logger.debug("%d workers of %s each", count, megabytes(2 * memory))
             yield client
     else:
         yield None
+
+
+@contextmanager
+def _connected(scheduler: str, security: Any | None) -> Iterator[Any]:
+    """A client of a scheduler that runs elsewhere."""
+    try:
+        client = distributed.Client(scheduler, security=security)
+    except (OSError, TimeoutError, CommClosedError) as error:
+        raise TaskError(f"no Dask scheduler answers at {scheduler}: {error}") from error
+    except (ValueError, TypeError) as error:  # TypeError: of certificates that are missing
+        raise UsageError(f"{scheduler!r} is no scheduler that can be asked: {error}") from error
+    with client:
+        yield client
+
+
+@contextmanager
+def report_kept(client: Any | None, path: str | os.PathLike[str]) -> Iterator[None]:
+    """Keep Dask's own performance report of what runs inside, as one HTML file.
+
+    Args:
+        client: a Dask client; None: there is nothing to report.
+        path: the file, replaced; where Dask cannot make it any more (the scheduler is lost), a
+            warning says so and nothing else is disturbed.
+    """
+    if client is None:
+        yield
+        return
+    report = distributed.performance_report(filename=os.fspath(path), mode="inline")
+    with client.as_current():
+        report.__enter__()
+        try:
+            yield
+        finally:
+            try:
+                report.__exit__(None, None, None)
+            except Exception as error:  # noqa: BLE001 - a report must not hide what happened
+                logger.warning("no Dask performance report at %s: %s", path, error or repr(error))

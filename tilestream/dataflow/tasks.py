@@ -28,6 +28,8 @@ class Outcome:
     """How long it ran [s]."""
     details: str = ""
     """The traceback of a failure, for --debug."""
+    passing: bool = False
+    """Whether another try may succeed: the machine failed, not the data."""
 
     @property
     def ok(self) -> bool:
@@ -42,18 +44,25 @@ def perform(task: Task) -> object:
 
 
 def attempt(task: Task) -> Outcome:
-    """Do the work of a task and say what became of it; never raises."""
-    began = time.perf_counter()
+    """Do the work of a task and say what became of it; never raises.
+
+    A verdict of our own on the data (`TilestreamError`) or a bug stands; where the disk, the
+    network or the memory failed, another try may succeed.
+    """
+    began, passing = time.perf_counter(), False
     try:
         result = perform(task)
     except TilestreamError as error:
         reason, details = str(error), traceback.format_exc()
     except MemoryError:
         reason, details = "out of memory: allow less work at a time (--memory)", ""
+        passing = True
     except OSError as error:
         reason, details = f"{error} ({type(error).__name__})", traceback.format_exc()
+        passing = True
     except Exception as error:  # noqa: BLE001 - whatever fails is listed, and the others go on
         reason, details = f"{type(error).__name__}: {error}", traceback.format_exc()
     else:
         return Outcome(task.key, task.stage, result, seconds=time.perf_counter() - began)
-    return Outcome(task.key, task.stage, None, reason, time.perf_counter() - began, details)
+    seconds = time.perf_counter() - began
+    return Outcome(task.key, task.stage, None, reason, seconds, details, passing)
