@@ -14,6 +14,7 @@ from bokeh.models import (
     NumeralTickFormatter,
 )
 from bokeh.models.annotations.legends import ColorBar
+from bokeh.models.renderers import GlyphRenderer
 from bokeh.plotting import figure
 from numpy.typing import NDArray
 
@@ -21,13 +22,20 @@ from tilestream.records import Float64
 from tilestream.report.colours import ACTUAL, AGAIN, HELD_OUT, MISSING, palette, scale_of
 from tilestream.report.findings import Findings, estimates
 from tilestream.report.judgement import worst_places
-from tilestream.report.summary import interval_factor, with_gaps
+from tilestream.report.summary import held_out_along, interval_factor, with_gaps
 from tilestream.report.words import CM_PER_M, length, percent, span
 
 MOST = 20_000
 """Places drawn on the map; of more, the worst of every few along a route."""
-TOOLS = "pan,wheel_zoom,box_zoom,reset,save"
-_TIP = (
+MAP_TOOLS = "pan,wheel_zoom,box_zoom,reset,save"
+PATH_TOOLS = "xpan,xwheel_zoom,xbox_zoom,reset"
+PATH_TIP = [
+    ("along", "@arc{0.0} m"),
+    ("measured", "@measured"),
+    ("estimate", "@shown"),
+    ("interval", "@interval"),
+]
+MAP_TIP = (
     '<div style="max-width:24em;font:13px system-ui,sans-serif;color:#222">'
     "<b>@route</b>, @arc{0.0} m along<br>"
     "estimate <b>@shown</b><br>interval @interval<br>starts that fail: @fail<br>"
@@ -44,7 +52,7 @@ def city_map(found: Findings) -> dict[str, Any]:
     places = found.places
     estimate = estimates(places)
     scale, colours = scale_of(estimate), palette()
-    plot = _plot(560, "x", "y", match_aspect=True)
+    plot = _plot(600, "x", "y", MAP_TOOLS, match_aspect=True)
     drawn = _drawn(places)
     origin = _origin(places)
     kinds = _kinds(places)
@@ -52,9 +60,9 @@ def city_map(found: Findings) -> dict[str, Any]:
         palette=colours, low=scale.low * CM_PER_M, high=scale.high * CM_PER_M
     )
     for kind, marker, name in (
-        ("missing", "x", "no estimate"),
         ("in_domain", "circle", "like the training places"),
         ("outside", "diamond", "unlike the training places"),
+        ("missing", "x", "no estimate"),
     ):
         rows = drawn[kinds[drawn] == kind]
         if not rows.size:
@@ -62,12 +70,12 @@ def city_map(found: Findings) -> dict[str, Any]:
         rows = rows[np.argsort(estimate[rows], kind="stable")]
         source = ColumnDataSource(_columns(places, rows, origin), name=kind)
         style: dict[str, Any] = (
-            {"color": MISSING, "size": 5, "line_width": 1.5}
+            {"color": MISSING, "size": 7, "line_width": 1.5}
             if kind == "missing"
             else {"color": {"field": "estimate", "transform": mapper}, "size": "size"}
         )
         glyphs = plot.scatter("x", "y", source=source, marker=marker, legend_label=name, **style)
-        plot.add_tools(HoverTool(renderers=[glyphs], tooltips=_TIP, point_policy="follow_mouse"))
+        plot.add_tools(_hover(glyphs, MAP_TIP, point_policy="follow_mouse"))
     _number_the_worst(plot, places, origin)
     if np.isfinite(estimate).any():
         bar = ColorBar(color_mapper=mapper, title="estimated error [cm]", width=12, padding=4)
@@ -159,70 +167,75 @@ def _number_the_worst(plot: figure, places: pd.DataFrame, origin: Float64) -> No
 
 
 def path_chart(found: Findings, path: str) -> dict[str, Any]:
-    """Measured error and held-out estimate along a path, each drive a line, the interval a band.
+    """Measured error and held-out estimate along a path: a line per drive, the interval a band.
 
-    The data sources are named by their group; lengths in centimetres.
+    The data sources are named by their group, and `estimate`; lengths in centimetres.
     """
     labels = found.labels[found.labels["path"].astype(str) == path]
     factor = interval_factor(found.coverage, path)
-    plot = _plot(260, "along the path [m]", "error [cm]", y_range=DataRange1d(start=0.0))
+    plot = _plot(280, "along the path [m]", "error [cm]", PATH_TOOLS, y_range=DataRange1d(start=0))
+    columns = _estimated(labels, factor)
+    _band(plot, columns)
     drives = list(labels.groupby("group", sort=True))
     for number, (group, part) in enumerate(drives):
-        columns = _along(part, factor)
-        source = ColumnDataSource(columns, name=str(group))
-        again = number > 0
-        if number == 0 and factor is not None:
-            _band(plot, columns)
-        measured = plot.line(
-            "arc",
-            "actual",
-            source=source,
-            color=AGAIN if again else ACTUAL,
-            line_width=1.6,
-            line_dash=(5, 3) if again else "solid",
-            legend_label=f"measured, {group}" if len(drives) > 1 else "measured",
-        )
-        estimate = f"estimate, {group}" if len(drives) > 1 else "estimate of a model without it"
         plot.line(
             "arc",
-            "estimate",
-            source=source,
-            color=HELD_OUT,
-            line_width=1.8,
-            line_dash=(2, 3) if again else "solid",
-            legend_label=estimate,
+            "measured",
+            source=ColumnDataSource(_measured(part), name=str(group)),
+            color=AGAIN if number else ACTUAL,
+            line_width=1.6,
+            line_dash=(5, 3) if number else "solid",
+            legend_label=f"measured, {group}" if len(drives) > 1 else "measured",
         )
-        tip = [
-            ("along", "@arc{0.0} m"),
-            ("drive", "@group"),
-            ("measured", "@actual{0.0} cm"),
-            ("estimate", "@estimate{0.0} cm"),
-            ("interval", "@interval"),
-        ]
-        plot.add_tools(HoverTool(renderers=[measured], tooltips=tip, mode="vline"))
+    source = ColumnDataSource(columns, name="estimate")
+    if np.isfinite(columns["estimate"]).any():
+        label = "estimate of a model without this path"
+        style: dict[str, Any] = {"color": HELD_OUT, "line_width": 1.8, "legend_label": label}
+        plot.line("arc", "estimate", source=source, **style)
+    anchor = plot.line("arc", "anchor", source=source, line_alpha=0.0)
+    plot.add_tools(_hover(anchor, PATH_TIP, mode="vline"))
     _finish(plot)
     return _item(plot, f"path-{path}")
 
 
-def _along(part: pd.DataFrame, factor: float | None) -> dict[str, Any]:
-    """A drive along a path; rows of NaN where its line is to be broken."""
-    breaks = with_gaps(part["arc_length"].to_numpy(np.float64))
-
-    def gapped(values: Float64) -> Float64:
-        return np.insert(values, breaks, np.nan)
-
-    held = part["held_out"].to_numpy(np.float64)
-    low, high = held / (factor or np.nan), held * (factor or np.nan)
-    arc = gapped(part["arc_length"].to_numpy(np.float64))
+def _measured(part: pd.DataFrame) -> dict[str, Any]:
+    """A drive along a path; NaN where its line is to be broken."""
+    arc = part["arc_length"].to_numpy(np.float64)
+    breaks = with_gaps(arc)
+    measured = part["error_mean"].to_numpy(np.float64) * CM_PER_M
     return {
-        "arc": arc,
-        "actual": gapped(part["error_mean"].to_numpy(np.float64)) * CM_PER_M,
-        "estimate": gapped(held) * CM_PER_M,
-        "low": gapped(low) * CM_PER_M,
-        "high": gapped(high) * CM_PER_M,
-        "interval": [span(a, b) for a, b in zip(gapped(low), gapped(high), strict=True)],
-        "group": [str(part["group"].iloc[0])] * len(arc),
+        "arc": np.insert(arc, breaks, np.nan),
+        "measured": np.insert(measured, breaks, np.nan),
     }
+
+
+def _estimated(labels: pd.DataFrame, factor: float | None) -> dict[str, Any]:
+    """The estimate at each labelled place of a path, its interval, and what was measured there."""
+    along = held_out_along(labels)
+    arc = along["arc_length"].to_numpy(np.float64)
+    breaks = with_gaps(arc)
+    held, mean = (along[name].to_numpy(np.float64) for name in ("held_out", "error_mean"))
+    low, high = held / (factor or np.nan), held * (factor or np.nan)
+    several = len(set(labels["group"])) > 1
+    said: dict[float, list[str]] = {}
+    for where, group, error in zip(
+        labels["arc_length"], labels["group"], labels["error_mean"], strict=True
+    ):
+        said.setdefault(where, []).append(length(error) + (f" ({group})" if several else ""))
+    lengths = {
+        "arc": arc,
+        "estimate": held * CM_PER_M,
+        "low": low * CM_PER_M,
+        "high": high * CM_PER_M,
+        "anchor": np.where(np.isfinite(held), held, mean) * CM_PER_M,
+    }
+    words = {
+        "measured": [", ".join(said[where]) for where in arc],
+        "shown": [length(e) for e in held],
+        "interval": [span(a, b) for a, b in zip(low, high, strict=True)],
+    }
+    columns: dict[str, Any] = {k: np.insert(v, breaks, np.nan) for k, v in lengths.items()}
+    return columns | {k: np.insert(v, breaks, "").tolist() for k, v in words.items()}
 
 
 def _band(plot: figure, columns: dict[str, Any]) -> None:
@@ -237,15 +250,20 @@ def _band(plot: figure, columns: dict[str, Any]) -> None:
             color=HELD_OUT,
             alpha=0.18,
             line_width=0,
-            legend_label="interval",
+            legend_label="its interval",
         )
 
 
-def _plot(height: int, x: str, y: str, **options: Any) -> figure:
+def _hover(glyphs: "GlyphRenderer[Any]", tip: Any, **options: Any) -> HoverTool:
+    """Shows what is under the mouse; no button of its own in the toolbar."""
+    return HoverTool(renderers=[glyphs], tooltips=tip, visible=False, **options)
+
+
+def _plot(height: int, x: str, y: str, tools: str, **options: Any) -> figure:
     plot = figure(
         height=height,
         sizing_mode="stretch_width",
-        tools=TOOLS,
+        tools=tools,
         x_axis_label=x,
         y_axis_label=y,
         output_backend="canvas",
@@ -256,8 +274,8 @@ def _plot(height: int, x: str, y: str, **options: Any) -> figure:
 
 
 def _finish(plot: figure) -> None:
-    """Calm, and see-through, so that the page's own colours stand behind."""
-    plot.background_fill_alpha = plot.border_fill_alpha = 0.0
+    """Calm; page.js lays the page's own colours under it (what is see-through is not wiped)."""
+    plot.background_fill_alpha = 0.0
     plot.outline_line_color = None
     plot.axis.axis_line_alpha = 0.4
     plot.axis.minor_tick_line_color = None
@@ -265,6 +283,9 @@ def _finish(plot: figure) -> None:
     plot.grid.grid_line_alpha = 0.35
     if plot.legend:
         plot.add_layout(plot.legend[0], "above")
+        plot.legend.location = "left"
+        plot.legend.spacing = 14
+        plot.legend.margin = 0
         plot.legend.orientation = "horizontal"
         plot.legend.background_fill_alpha = 0.0
         plot.legend.border_line_alpha = 0.0

@@ -22,7 +22,7 @@ CLIP = 0.98
 
 def palette() -> list[str]:
     """Low to high: plasma without its ends, which vanish on a dark and on a light page."""
-    ramp = mpl.colormaps["plasma"](np.linspace(0.06, 0.86, STEPS))
+    ramp = mpl.colormaps["plasma"](np.linspace(0.1, 0.86, STEPS))
     return [mpl.colors.to_hex(colour) for colour in ramp]
 
 

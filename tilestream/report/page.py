@@ -45,7 +45,7 @@ def page(found: Findings, content: Mapping[str, Any], pictures: Mapping[int, byt
         sections.facts(content),
     )
     charts = [city_map(found)]
-    for number, path in enumerate(content["paths"]):
+    for number, path in enumerate(content["paths"][: sections.MOST_PATHS]):
         charts.append(path_chart(found, path["path"]) | {"target_id": f"path-{number}"})
     links = "".join(f'<a href="#{name}">{title}</a>' for name, title in CONTENTS)
     return (

@@ -1,8 +1,8 @@
 """Pictures as PNG: the worst places from above, and the charts for papers and slides."""
 
 import io
-from collections.abc import Callable
 
+import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
@@ -24,15 +24,16 @@ from tilestream.report.colours import (
 )
 from tilestream.report.findings import AROUND, Findings, estimates
 from tilestream.report.judgement import worst_places
-from tilestream.report.summary import interval_factor, with_gaps
+from tilestream.report.summary import held_out_along, interval_factor, with_gaps
 from tilestream.report.words import CM_PER_M
 
 PIXEL = 0.25
 """Edge of a pixel of the view from above [m]."""
 BELOW, ABOVE = 3.0, 10.0
 """Heights that the colours span, below and above the lidar [m]."""
+HEIGHTS, NOTHING = "viridis", "#15181d"
+"""Colour map of the heights, and where the map has no points."""
 PATHS_ON_A_FIGURE = 12
-Draw = Callable[[], Figure]
 
 
 def png(figure: Figure, dpi: int = 110) -> bytes:
@@ -54,14 +55,14 @@ def surroundings(points: Float64, place: Float64, heading: float) -> Figure:
         heading: of travel there [rad].
     """
     height = _seen_from_above(points - place)
-    figure = Figure(figsize=(3.4, 3.4), layout="constrained")
-    axes = figure.add_subplot()
-    axes.set_facecolor("#15181d")
-    image = axes.imshow(
+    figure = Figure(figsize=(3.0, 3.0))
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.set_facecolor(NOTHING)
+    axes.imshow(
         height,
         origin="lower",
         extent=(-AROUND, AROUND, -AROUND, AROUND),
-        cmap="viridis",
+        cmap=HEIGHTS,
         vmin=-BELOW,
         vmax=ABOVE,
         interpolation="nearest",
@@ -73,10 +74,12 @@ def surroundings(points: Float64, place: Float64, heading: float) -> Figure:
     axes.plot([-36.0, -26.0], [-36.0, -36.0], color="white", lw=2.0)
     axes.text(-31.0, -34.5, "10 m", color="white", ha="center", va="bottom", fontsize=8)
     axes.set(xlim=(-AROUND, AROUND), ylim=(-AROUND, AROUND), xticks=[], yticks=[])
-    bar = figure.colorbar(image, ax=axes, shrink=0.8, pad=0.02, extend="both")
-    bar.set_label("height from the lidar [m]", fontsize=7)
-    bar.ax.tick_params(labelsize=7)
     return figure
+
+
+def heights_ramp(steps: int = 9) -> list[str]:
+    """The colours of the heights from `BELOW` to `ABOVE`, for a legend."""
+    return [mpl.colors.to_hex(c) for c in mpl.colormaps[HEIGHTS](np.linspace(0.0, 1.0, steps))]
 
 
 def _seen_from_above(offset: Float64) -> Float64:
@@ -96,11 +99,11 @@ def map_figure(found: Findings) -> Figure:
     scale = scale_of(estimate)
     figure = Figure(figsize=(10.0, 7.5), layout="constrained")
     axes = figure.add_subplot()
-    axes.scatter(at[~known, 0], at[~known, 1], s=8, c=MISSING, marker="x", lw=0.8)
     order = np.flatnonzero(known)[np.argsort(estimate[known], kind="stable")]
     colours = np.array(palette())
     step = scale.step(estimate[order])
     axes.scatter(at[order, 0], at[order, 1], s=8 + step / 6.0, c=colours[step].tolist(), lw=0)
+    axes.scatter(at[~known, 0], at[~known, 1], s=20, c=MISSING, marker="x", lw=1.0)
     for number, row in enumerate(worst_places(places), start=1):
         box = {"boxstyle": "circle,pad=0.25", "fc": "#111111", "ec": "white"}
         axes.annotate(
@@ -134,7 +137,15 @@ def paths_figure(found: Findings) -> Figure:
         here = found.labels[found.labels["path"].astype(str) == name]
         factor = interval_factor(found.coverage, name)
         for number, (_, part) in enumerate(here.groupby("group", sort=True)):
-            _draw_drive(axes, part, factor if number == 0 else None, again=number > 0)
+            arc, measured = _broken(part, "error_mean")
+            axes.plot(
+                arc, measured, "--" if number else "-", color=AGAIN if number else ACTUAL, lw=1.1
+            )
+        arc, held = _broken(held_out_along(here), "held_out")
+        axes.plot(arc, held, color=HELD_OUT, lw=1.4)
+        if factor is not None:
+            low, high = held / factor, held * factor
+            axes.fill_between(arc, low, high, color=HELD_OUT, alpha=0.18, lw=0)
         axes.set_title(f"path {name}", loc="left", fontsize=10)
         axes.set(ylabel="error [cm]", ylim=(0.0, None))
         axes.grid(alpha=0.25)
@@ -153,19 +164,12 @@ def paths_figure(found: Findings) -> Figure:
     return figure
 
 
-def _draw_drive(axes: Axes, part: pd.DataFrame, factor: float | None, *, again: bool) -> None:
-    arc = part["arc_length"].to_numpy(np.float64)
+def _broken(along: pd.DataFrame, name: str) -> tuple[Float64, Float64]:
+    """Arc length [m] and a column [cm], with NaN where the line is to be broken."""
+    arc = along["arc_length"].to_numpy(np.float64)
     breaks = with_gaps(arc)
-    arc = np.insert(arc, breaks, np.nan)
-    measured, held = (
-        np.insert(part[name].to_numpy(np.float64), breaks, np.nan) * CM_PER_M
-        for name in ("error_mean", "held_out")
-    )
-    style = {"color": AGAIN, "ls": "--", "lw": 1.0} if again else {"color": ACTUAL, "lw": 1.2}
-    axes.plot(arc, measured, **style)  # type: ignore[arg-type]
-    axes.plot(arc, held, color=HELD_OUT, lw=1.3, ls=":" if again else "-")
-    if factor is not None:
-        axes.fill_between(arc, held / factor, held * factor, color=HELD_OUT, alpha=0.18, lw=0)
+    values = along[name].to_numpy(np.float64) * CM_PER_M
+    return np.insert(arc, breaks, np.nan), np.insert(values, breaks, np.nan)
 
 
 def importances_figure(importances: pd.DataFrame) -> Figure:

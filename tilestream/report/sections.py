@@ -13,6 +13,7 @@ from tilestream.report.charts import shown_every
 from tilestream.report.colours import ACTUAL, CLIP, CRITERION, HELD_OUT, OTHER
 from tilestream.report.findings import AROUND, Findings
 from tilestream.report.judgement import APART
+from tilestream.report.pictures import ABOVE, BELOW, heights_ramp
 from tilestream.report.words import (
     DASH,
     bar,
@@ -32,6 +33,10 @@ MOST_REASONS = 8
 """Reasons for missing estimates that are listed; the rest is summed up."""
 MOST_SEGMENTS = 15
 """Segments that the page lists; the file has all."""
+MOST_PATHS = 24
+"""Labelled paths that have a chart."""
+MOST_ROUTES = 40
+"""Routes that the page lists, the worst by their 95 % quantile; `report.json` has all."""
 NAMES = {"FS": "feature sufficiency", "RQ": "representation quality", "LY": "layout",
          "LS": "local similarity"}  # fmt: skip
 PAPER_IMPORTANCES = {
@@ -62,6 +67,8 @@ PROTOCOL_NAMES = {
     "blocks": "held-out blocks",
 }
 FIGURES = ("MAE", "RMSE", "&lt; 2.5 cm", "&lt; 5 cm", "R²", "skill", "Spearman")
+LEAKING = "paper"
+"""The protocol whose figures prove nothing."""
 LEAKS = '<span class="mark">leaks</span>'
 
 
@@ -91,6 +98,7 @@ def headline(content: Mapping[str, Any]) -> str:
             f"of the places over {limit}: {road(head['over_length'])} of road",
         ),
         (percent(head["outside_share"]), "of the places unlike the training places"),
+        (count(head["labelled"]), "measured errors to train on and to judge by"),
         (count(head["missing"]), f"places without an estimate ({percent(head['missing_share'])})"),
     ]
     body = '<div class="cards">' + "".join(
@@ -133,9 +141,17 @@ def _routes(content: Mapping[str, Any], limit: str) -> str:
             percent(r["outside_share"]),
             count(r["missing"]),
         ]
-        for r in content["routes"]
+        for r in _listed(content["routes"])
     ]
-    return "<h3>By route</h3>" + table(head, rows)
+    more = len(content["routes"]) - len(rows)
+    note = f"<p>{more} routes with lower estimates are in <code>report.json</code>.</p>"
+    return "<h3>By route</h3>" + table(head, rows) + (note if more else "")
+
+
+def _listed(routes: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    if len(routes) <= MOST_ROUTES:
+        return routes
+    return sorted(routes, key=lambda r: (-(r["p95"] or 0.0), r["route_id"]))[:MOST_ROUTES]
 
 
 def city_map(found: Findings, content: Mapping[str, Any]) -> str:
@@ -186,41 +202,55 @@ def worst(content: Mapping[str, Any], pictures: Mapping[int, bytes | str]) -> st
     rows = [
         [
             str(number),
-            _picture(pictures.get(number, "no map at hand"), number),
-            _where(p),
-            f"<b>{length(p['estimate'])}</b>" + _small(f"interval {span(p['low'], p['high'])}"),
+            f"<b>{esc(p['route_id'])}</b>, {p['arc_length']:.0f}\u00a0m along" + _small(_at(p)),
+            f"<b>{length(p['estimate'])}</b>",
+            span(p["low"], p["high"]),
             percent(p["p_fail"]),
             "yes" if p["in_domain"] else "no",
             esc(p["reason"] or "") or DASH,
         ]
         for number, p in enumerate(content["worst"], start=1)
     ]
-    head = ["", "from above", "where", "estimate", "starts that fail", "like training", "why"]
+    head = ["", "where", "estimate", "interval", "starts that fail", "like training", "why"]
     meaning = (
         f"The highest estimates that lie at least {APART:.0f} m apart, and what drives each of "
-        f"them; the pictures show the map within {AROUND:.0f} m, its y axis up, and the arrow the "
-        "direction of travel."
+        "them; numbers as on the map."
     )
-    body = table(head, rows, "words places") if rows else empty("No place has an estimate.")
     title = f"The worst {len(rows)} places" if len(rows) > 1 else "The worst place"
+    if not rows:
+        return section("worst", title, meaning, empty("No place has an estimate."))
+    views = "".join(_view(n, p, pictures) for n, p in enumerate(content["worst"], start=1))
+    body = table(head, rows, "words worst") + _HEIGHTS + f'<div class="views">{views}</div>'
     return section("worst", title, meaning, body)
 
 
-def _where(p: Mapping[str, Any]) -> str:
-    at = f"x {p['x']:.1f}, y {p['y']:.1f}" if known(p["x"]) and known(p["y"]) else "no position"
-    return f"<b>{esc(p['route_id'])}</b><br>{p['arc_length']:.0f} m along" + _small(at)
+def _at(p: Mapping[str, Any]) -> str:
+    return f"x {p['x']:.1f}, y {p['y']:.1f}" if known(p["x"]) and known(p["y"]) else "no position"
 
 
 def _small(text: str) -> str:
     return f'<br><span class="small">{text}</span>'
 
 
-def _picture(picture: bytes | str, number: int) -> str:
+def _view(number: int, p: Mapping[str, Any], pictures: Mapping[int, bytes | str]) -> str:
+    """A place from above, or why there is no picture of it."""
+    picture = pictures.get(number, "none was taken")
     if isinstance(picture, str):
-        return f'<span class="small">no picture: {esc(picture)}</span>'
-    data = base64.b64encode(picture).decode("ascii")
-    text = f"The map round place {number} from above"
-    return f'<img alt="{text}" src="data:image/png;base64,{data}">'
+        shown = f'<span class="none">no picture: {esc(picture)}</span>'
+    else:
+        data = base64.b64encode(picture).decode("ascii")
+        text = f"The map round place {number} from above"
+        shown = f'<img alt="{text}" src="data:image/png;base64,{data}">'
+    where = f"{esc(p['route_id'])}, {p['arc_length']:.0f}\u00a0m"
+    return f"<figure>{shown}<figcaption><b>{number}</b> {where}</figcaption></figure>"
+
+
+_HEIGHTS = (
+    '<p class="ramp">Each picture is the map within '
+    f"{AROUND:.0f} m from above, its y axis up, the arrow the direction of travel; height from the "
+    f'lidar: {-BELOW:.0f}\u00a0m <span style="background:linear-gradient(to right,'
+    f'{",".join(heights_ramp())})"></span> {ABOVE:.0f}\u00a0m and more</p>'
+)
 
 
 def paths(content: Mapping[str, Any]) -> str:
@@ -232,8 +262,10 @@ def paths(content: Mapping[str, Any]) -> str:
     )
     body = "".join(
         f'<h3>Path {esc(p["path"])}</h3><p>{_of_path(p)}</p><div class="chart" id="path-{k}"></div>'
-        for k, p in enumerate(content["paths"])
+        for k, p in enumerate(content["paths"][:MOST_PATHS])
     )
+    if more := len(content["paths"][MOST_PATHS:]):
+        body += f"<p>{more} more paths are in <code>report.json</code>.</p>"
     why = "No place was labelled: without a log of scans there is no measured error to show."
     return section("paths", "Measured and estimated error", meaning, body or empty(why))
 
@@ -253,9 +285,10 @@ def _of_path(p: Mapping[str, Any]) -> str:
 def importances(found: Findings) -> str:
     """What the forest looks at."""
     meaning = (
-        "The share of the forest's splits that each factor accounts for, beside the paper's "
-        "Fig. 14. The counts are all correlated and share it among them, so the second table is "
-        "the honest one: how much worse unseen blocks are estimated without what a criterion knows."
+        "How much of what the forest explains of its own training points it explains by each "
+        "factor, beside the paper's Fig. 14. The counts are all correlated and share it, so the "
+        "second table is the honest one: how much worse unseen blocks are estimated when a "
+        "criterion's factors are shuffled."
     )
     parts = []
     if found.importances.empty:
@@ -287,7 +320,7 @@ def _of_factors(found: pd.DataFrame) -> str:
             ]
         )
     return "<h3>By factor</h3>" + table(
-        ["factor", "criterion", "", "importance", "the paper's"], rows, "bars"
+        ["factor", "criterion", "", "importance", "the paper's"], rows, "bars named"
     )
 
 
@@ -350,7 +383,8 @@ def protocols(found: Findings) -> str:
         parts.append(empty("No place was driven twice in this run, so no ceiling is known."))
     else:
         cells = [["a second drive over the same places", *_figures(found.ceiling)]]
-        parts.append("<h3>The ceiling</h3>" + table(["", *FIGURES], cells, "figures"))
+        text = "<p>Two measurements of one place differ by this much: no map can tell more.</p>"
+        parts.append(f"<h3>the ceiling</h3>{text}" + table(["", *FIGURES], cells, "figures"))
     return section("protocols", "How good the estimates are", meaning, "".join(parts))
 
 
@@ -374,7 +408,8 @@ def _protocol(name: str, rows: list[dict[str, Any]]) -> str:
     rest = [r for r in judged if r["model"] not in FORESTS | OTHERS | OPPONENTS]
     if rest:
         groups.append(("others", [[_model(r["model"]), *_figures(r)] for r in rest]))
-    return f"{text}{_verdict(judged)}</p>" + grouped_table(head, groups, "figures")
+    verdict = "" if name == LEAKING else _verdict(judged)
+    return f"{text}{verdict}</p>" + grouped_table(head, groups, "figures")
 
 
 def _verdict(judged: list[dict[str, Any]]) -> str:
@@ -398,7 +433,7 @@ def _model(name: object) -> str:
 
 
 def _protocol_name(name: str) -> str:
-    return f"{PROTOCOL_NAMES.get(name, esc(name))}{' ' + LEAKS if name == 'paper' else ''}"
+    return f"{PROTOCOL_NAMES.get(name, esc(name))}{' ' + LEAKS if name == LEAKING else ''}"
 
 
 def _by_protocol(found: pd.DataFrame) -> list[tuple[str, list[dict[str, Any]]]]:
@@ -448,12 +483,15 @@ def calibration(found: Findings) -> str:
             percent(r["level"]),
             percent(r["covered"]),
             _gauge(r["covered"], r["level"]),
-            f"× {r['factor']:.2f}" if known(r["factor"]) else "not calibrated",
+            f"f = {r['factor']:.2f}" if known(r["factor"]) else "not calibrated",
         ]
         for r in _records(found.coverage)
     ]
-    head = ["path", "points", "promised", "held", "", "the error may be larger or smaller by"]
-    body = table(head, rows, "bars")
+    head = ["path", "points", "promised", "held", "", "from estimate / f to estimate × f"]
+    judged = [r for r in _records(found.coverage) if known(r["covered"])]
+    held = sum(r["covered"] >= r["level"] for r in judged)
+    verdict = f"<p><b>The promise was held on {held} of {len(judged)} paths.</b></p>"
+    body = (verdict if judged else "") + table(head, rows, "bars")
     return section("calibration", "Do the intervals hold", meaning, body)
 
 
@@ -499,6 +537,8 @@ def _flat(prefix: str, values: Mapping[str, Any]) -> list[tuple[str, str]]:
             lines += _flat(f"{prefix}{name}.", value)
         elif isinstance(value, list):
             lines.append((f"{prefix}{name}", ", ".join(map(str, value)) or DASH))
+        elif isinstance(value, bool):
+            lines.append((f"{prefix}{name}", "yes" if value else "no"))
         elif isinstance(value, float):
             lines.append((f"{prefix}{name}", f"{value:.6g}"))
         else:

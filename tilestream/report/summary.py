@@ -32,7 +32,7 @@ def summary(found: Findings, threshold: float) -> dict[str, Any]:
         "tilestream": VERSION,
         "threshold": threshold,
         "crs": found.crs,
-        "headline": headline(found.places, threshold),
+        "headline": headline(found.places, threshold) | {"labelled": len(found.labels)},
         "routes": routes(found.places, threshold),
         "segments": [segment(found.places, rows) for rows in runs],
         "worst": [place(found.places, row) for row in worst_places(found.places)],
@@ -151,6 +151,15 @@ def interval_factor(coverage: pd.DataFrame, path: str) -> float | None:
         return None
     factor = coverage.loc[coverage["path"].astype(str) == path, "factor"].to_numpy(np.float64)
     return float(factor[0]) if factor.size and np.isfinite(factor[0]) else None
+
+
+def held_out_along(labels: pd.DataFrame) -> pd.DataFrame:
+    """The held-out estimate of each labelled place of a path: drives over a place share it.
+
+    Returns:
+        A row per `arc_length` [m], rising, with `held_out` [m] and `error_mean` (of all drives).
+    """
+    return labels.groupby("arc_length", as_index=False)[["held_out", "error_mean"]].mean()
 
 
 def with_gaps(arc: Float64) -> Int64:

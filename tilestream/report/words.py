@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 
 CM_PER_M = 100.0
+_GLUE = "\u00a0"
+"""Between a figure and its unit, where a line must not break."""
 NONE = "none"
 """Stands where there is no figure."""
 DASH = "–"
@@ -24,19 +26,19 @@ def known(value: Any) -> bool:
 
 def length(metres: Any, digits: int = 1) -> str:
     """An error in centimetres."""
-    return f"{metres * CM_PER_M:.{digits}f} cm" if known(metres) else NONE
+    return f"{metres * CM_PER_M:.{digits}f}{_GLUE}cm" if known(metres) else NONE
 
 
 def span(low: Any, high: Any) -> str:
     """An interval in centimetres."""
     if not (known(low) and known(high)):
         return NONE
-    return f"{low * CM_PER_M:.1f} to {high * CM_PER_M:.1f} cm"
+    return f"{low * CM_PER_M:.1f} to {high * CM_PER_M:.1f}{_GLUE}cm"
 
 
 def percent(share: Any, digits: int = 1) -> str:
     """A share."""
-    return f"{share * 100.0:.{digits}f} %" if known(share) else NONE
+    return f"{share * 100.0:.{digits}f}{_GLUE}%" if known(share) else NONE
 
 
 def plain_number(value: Any, digits: int = 2) -> str:
@@ -46,7 +48,7 @@ def plain_number(value: Any, digits: int = 2) -> str:
 
 def road(metres: float) -> str:
     """A length of road."""
-    return f"{metres / 1000.0:.2f} km" if metres >= 1000.0 else f"{metres:.0f} m"
+    return f"{metres / 1000.0:.2f}{_GLUE}km" if metres >= 1000.0 else f"{metres:.0f}{_GLUE}m"
 
 
 def count(number: float) -> str:
