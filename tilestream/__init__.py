@@ -11,6 +11,9 @@ from tilestream.config import StartSettings as StartSettings
 from tilestream.dataflow.factors_route import factors_along as factors_along
 from tilestream.dataflow.ingest_map import ingest as ingest
 from tilestream.dataflow.localize_drive import localize as localize
+from tilestream.dataflow.main_job import dataset as dataset
+from tilestream.dataflow.main_job import run as run
+from tilestream.dataflow.run_settings import RunSettings as RunSettings
 from tilestream.factors.sample_points import sample_points as sample_points
 from tilestream.factors.table import factors as factors
 from tilestream.formats.mcap import ScanSelection as ScanSelection

@@ -21,6 +21,8 @@ from rich.logging import RichHandler
 
 from tilestream.cli.progress import err, progress
 from tilestream.cli.tables import (
+    TILE_CHANGES,
+    diff_table,
     error_facts,
     error_table,
     factor_table,
@@ -39,6 +41,7 @@ from tilestream.dataflow.localize_drive import localize as localize_drive
 from tilestream.dataflow.localize_drive import plan_localize
 from tilestream.dataflow.localize_tasks import Reading
 from tilestream.dataflow.main_plan import forecast
+from tilestream.dataflow.map_diff import WORSE, diff
 from tilestream.dataflow.run import dask_client
 from tilestream.dataflow.run_settings import read_settings
 from tilestream.dataflow.simulate import SCENE_BYTES
@@ -465,6 +468,23 @@ def plan_job(
     out.print(forecast_table(rows))
     for note in expected.notes:
         out.print(note, highlight=False, soft_wrap=True)
+
+
+@app.command("diff")
+def diff_maps(
+    old: Annotated[str, typer.Argument(help="A run directory or tile store.")],
+    new: Annotated[str, typer.Argument(help="The newer one.")],
+    worse: Annotated[float, typer.Option(help="List estimates that grew by more [m].")] = WORSE,
+    as_json: Annotated[bool, typer.Option("--json", help="For machines.")] = False,
+) -> None:
+    """What a map update changes: tiles, and sample points whose estimate got worse."""
+    found = diff(old, new, worse=worse)
+    if as_json:
+        tiles = {kind: [str(k) for k in getattr(found, kind)] for kind in TILE_CHANGES}
+        points = found.worse.to_dict("records")
+        print_json({**tiles, "same": found.same, "compared": found.compared, "worse": points})
+    else:
+        out.print(diff_table(found))
 
 
 @app.command()

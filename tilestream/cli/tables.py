@@ -9,6 +9,7 @@ from rich.table import Table
 
 from tilestream.dataflow.calibration import core_hours
 from tilestream.dataflow.main_plan import Forecast
+from tilestream.dataflow.map_diff import MapDiff
 from tilestream.dataflow.plan import Plan, megabytes
 from tilestream.factors.catalogue import COLUMNS
 from tilestream.formats.base import SourceInfo
@@ -165,4 +166,26 @@ def report_table(report: dict[str, Any]) -> Table:
     for worst in report["worst"][:3]:
         where = f"worst: {worst['route_id']} at {worst['arc_length']:.0f} m"
         table.add_row(where, f"{worst['estimate']:.3g} m")
+    return table
+
+
+TILE_CHANGES = ("added", "removed", "changed")
+
+
+def diff_table(found: MapDiff) -> Table:
+    """What a map update changes."""
+    table = Table(title="map update", title_justify="left", box=SIMPLE)
+    table.add_column("what")
+    table.add_column("count", justify="right")
+    table.add_column("which")
+    for kind in TILE_CHANGES:
+        keys = [str(key) for key in getattr(found, kind)]
+        more = " …" if len(keys) > 10 else ""
+        table.add_row(f"tiles {kind}", str(len(keys)), " ".join(keys[:10]) + more)
+    table.add_row("tiles the same", str(found.same), "")
+    table.add_row("sample points compared", str(found.compared), "")
+    table.add_row("sample points that got worse", str(len(found.worse)), "")
+    for row in found.worse.head(10).itertuples():
+        where = f"{row.route_id} at {row.arc_length:.0f} m"
+        table.add_row(where, "", f"{row.before:.3g} m to {row.after:.3g} m")
     return table

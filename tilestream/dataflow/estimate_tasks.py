@@ -19,6 +19,7 @@ from tilestream.factors.catalogue import COLUMNS
 from tilestream.forest.dataset import Dataset, features_of, join
 from tilestream.forest.evaluation import criterion_importances, factor_sets, importances, judge
 from tilestream.forest.model_file import load_model, save_model
+from tilestream.forest.protocols import PROTOCOLS
 from tilestream.forest.training import PREDICTION_COLUMNS, Model, predict, train
 from tilestream.records import Column
 from tilestream.store import hash_of
@@ -248,12 +249,14 @@ def _judge(task: JudgeTask) -> int:
     if is_done(task.out, task.identity):
         return 0
     dataset = _dataset(task.dataset, _dataset_identity(task.dataset))
-    if task.target not in dataset.rows:
-        raise ModelError(f"the labels have no {task.target}")
     if task.factor_set:
         dataset = dataset.with_columns(factor_sets(dataset.columns)[task.factor_set])
-    dataset.check(task.target)
-    judged = judge(dataset, task.competitor, task.target, task.seed)
+    try:
+        dataset.check(task.target)
+    except ModelError as error:  # told beside the figures; the train task fails for it
+        judged: dict[str, pd.DataFrame | str] = {p.name: str(error) for p in PROTOCOLS}
+    else:
+        judged = judge(dataset, task.competitor, task.target, task.seed)
     parts = [p.assign(protocol=name) for name, p in judged.items() if not isinstance(p, str)]
     reasons = {name: found for name, found in judged.items() if isinstance(found, str)}
     frame = pd.concat(parts, ignore_index=True) if parts else _NOTHING_JUDGED
@@ -271,7 +274,7 @@ _NOTHING_JUDGED = pd.DataFrame(
 )
 
 
-def judged(path: str) -> dict[str, pd.DataFrame | str]:
+def read_judged(path: str) -> dict[str, pd.DataFrame | str]:
     """What a judge task found, as `evaluation.judge` gives it."""
     mark, points = read_mark(path), read_tables([path])
     assert mark is not None  # `read_tables` has read it

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from tilestream.dataflow.estimate_tasks import JudgeTask, PredictTask, WeighTask, judged
+from tilestream.dataflow.estimate_tasks import JudgeTask, PredictTask, WeighTask, read_judged
 from tilestream.dataflow.localize_tasks import box_around
 from tilestream.dataflow.plan import Task
 from tilestream.errors import ModelError
@@ -38,7 +38,7 @@ class Done:
     def judgements(self) -> dict[tuple[str, str, str], dict[str, pd.DataFrame | str]]:
         """What was judged, by (target, competitor, factor set; empty: all factors)."""
         tasks = [task for task in self.estimate if isinstance(task, JudgeTask)]
-        return {(t.target, t.competitor, t.factor_set): judged(t.out) for t in tasks}
+        return {(t.target, t.competitor, t.factor_set): read_judged(t.out) for t in tasks}
 
 
 def places_of(done: Done) -> pd.DataFrame:

@@ -35,7 +35,7 @@ from tilestream.errors import SourceNotFoundError, StoreNotFoundError, UsageErro
 from tilestream.factors.catalogue import COLUMNS
 from tilestream.forest.dataset import features_of, made_with
 from tilestream.forest.evaluation import factor_sets
-from tilestream.forest.models import COMPETITORS, FORESTS, OPPONENTS
+from tilestream.forest.models import COMPETITORS, OPPONENTS
 from tilestream.formats import describe
 from tilestream.formats.mcap import ScanSelection
 from tilestream.formats.routes import read_routes
@@ -295,10 +295,10 @@ def plan_estimate(settings: RunSettings, measure: Plan, outcomes: Sequence[Outco
 
 
 def judges(join: JoinTask, folder: str, seed: int) -> list[Task]:
-    """Every model and opponent on all factors, and the forests on each set of Table IV."""
+    """Every model and opponent on all factors, and the paper's forest on each set of Table IV."""
     wanted = [(MAIN, competitor, "") for competitor in COMPETITORS]
     sets = [name for name in factor_sets(features_of(COLUMNS)) if name != "all + robust"]
-    wanted += [(MAIN, forest, name) for name in sets for forest in FORESTS]
+    wanted += [(MAIN, "paper", name) for name in sets]
     simple = [name for name in OPPONENTS if name != "footprint forest"]
     wanted += [(target, name, "") for target in PARTS for name in ("default", *simple)]
     tasks: list[Task] = [

@@ -1,0 +1,55 @@
+"""Three short streets, far apart on one map, and a drive along each: a whole job in miniature."""
+
+from pathlib import Path
+
+import logs
+import numpy as np
+from logs import SECOND, START, pose
+from scenes import PLACES, in_map
+
+from tilestream.dataflow.run_settings import RunSettings
+from tilestream.formats.pcd import write_pcd
+
+STREETS = {"canyon": 0.0, "tunnel": 400.0, "crossing": 800.0}
+"""Kind of each street, and where it begins [m, map x]."""
+LENGTH = 44.0
+SCANS = 26
+"""One per metre of a drive."""
+REACH = 14.0
+"""How far its lidar sees [m]."""
+
+
+def street(kind: str, seed: int, spacing: float) -> np.ndarray:
+    points = PLACES[kind](np.random.default_rng(seed), LENGTH, spacing)
+    return in_map(points, (STREETS[kind], 0.0, 0.0))
+
+
+def write_drive(path: Path, kind: str) -> Path:
+    messages: list[logs.Message] = []
+    seen = street(kind, 100, 0.7)
+    for i in range(SCANS):
+        T_map_lidar = pose(x=STREETS[kind] + 8.0 + i, y=0.1 * np.sin(i), z=2.0)
+        stamp = START + i * SECOND
+        points = (seen - T_map_lidar[:3, 3]) @ T_map_lidar[:3, :3]
+        near = points[np.linalg.norm(points, axis=1) < REACH]
+        messages.append(logs.odometry_at(stamp, T_map_lidar))
+        messages.append(logs.cloud_at(stamp, near))
+    return logs.write(path, messages, chunk_size=200_000)
+
+
+def write_inputs(folder: Path) -> None:
+    """`map_<kind>.pcd` and `<kind>.mcap` of every street."""
+    for kind in STREETS:
+        write_pcd(folder / f"map_{kind}.pcd", street(kind, 1, 0.3))
+        write_drive(folder / f"{kind}.mcap", kind)
+
+
+def job(folder: Path, out: Path, **changes: object) -> RunSettings:
+    """The settings of the job over `write_inputs`."""
+    values: dict[str, object] = {
+        "out": str(out),
+        "map": {"sources": [str(folder / "map_*.pcd")], "tile_size": 50.0},
+        "drives": [{"log": str(folder / f"{kind}.mcap")} for kind in STREETS],
+        "label": {"matcher": "default", "starts": {"radius": 0.4, "step": 0.2}},
+    }
+    return RunSettings(**(values | changes))

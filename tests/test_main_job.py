@@ -1,0 +1,445 @@
+"""The main job: from map and drives to estimates; nothing done twice, nothing mixed, all told."""
+
+import hashlib
+import json
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import streets
+import yaml
+from streets import SCANS, STREETS, job
+
+import tilestream as ts
+from tilestream.cli import run as command
+from tilestream.dataflow import estimate_tasks, main_job
+from tilestream.dataflow.calibration import calibration_file, core_hours, learn
+from tilestream.dataflow.main_plan import forecast
+from tilestream.dataflow.run import dask_client
+from tilestream.dataflow.run_settings import RunSettings, read_settings
+from tilestream.dataflow.tasks import Outcome
+from tilestream.errors import ModelError, PartialError, SourceNotFoundError, UsageError
+from tilestream.forest import evaluation, models, training
+from tilestream.forest.models import Recipe
+from tilestream.forest.training import PREDICTION_COLUMNS
+
+
+class Told:
+    """What a run tells of its tasks."""
+
+    def __init__(self) -> None:
+        self.outcomes: list[Outcome] = []
+
+    def __call__(self, outcome: Outcome, ended: int, total: int) -> None:
+        assert 0 < ended <= total
+        self.outcomes.append(outcome)
+
+    def worked(self) -> set[str]:
+        """Stages of which a task after measuring wrote something."""
+        late = ("register", "label", "factors", "join", "judge", "weigh", "train", "predict")
+        return {o.stage for o in self.outcomes if o.stage in late and o.result}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_forests() -> Iterator[None]:
+    """Five trees instead of a hundred: these tests are about the job, not about the forest."""
+    with pytest.MonkeyPatch.context() as patch:
+        quick = Recipe(trees=5)
+        patch.setattr(models, "PAPER", quick)
+        patch.setattr(models, "CANDIDATES", (Recipe(trees=4, leaf=2, log=True),))
+        patch.setattr(training, "PAPER", quick)
+        patch.setattr(evaluation.importances, "__defaults__", ("error_mean", quick, 0))
+        patch.setattr(evaluation.criterion_importances, "__defaults__", ("error_mean", quick, 0))
+        yield
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("inputs")
+    streets.write_inputs(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def done(inputs: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Told]:
+    told = Told()
+    folder = tmp_path_factory.mktemp("done") / "run"
+    assert ts.run(job(inputs, folder), watch=told) == folder
+    return folder, told
+
+
+@pytest.fixture
+def copy(done: tuple[Path, Told], tmp_path: Path) -> Path:
+    """The run directory at its own place again, so that a test may change it."""
+    kept = tmp_path / "kept"
+    shutil.copytree(done[0], kept)
+    yield done[0]
+    shutil.rmtree(done[0])
+    shutil.move(kept, done[0])
+
+
+def hashes(folder: Path) -> dict[str, str]:
+    """Of every table; the model is judged by its estimates, which are among them."""
+    files = sorted((folder / "tables").rglob("*.parquet"))
+    return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+
+
+# --- What a run directory holds
+
+
+def test_every_sample_point_has_an_estimate_with_its_interval(done: tuple[Path, Told]) -> None:
+    places = pd.read_parquet(done[0] / "report" / "places.parquet")
+    assert len(places) == len(STREETS) * SCANS
+    assert set(places["route_id"]) == set(STREETS)
+    assert (places["status"] == "done").all()
+    assert (places["low"] <= places["estimate"]).all()
+    assert (places["estimate"] <= places["high"]).all()
+    assert {column.name for column in PREDICTION_COLUMNS} <= set(places)
+
+
+def test_the_dataset_is_the_join_of_factors_and_errors(done: tuple[Path, Told]) -> None:
+    dataset = ts.dataset(done[0])
+    rows = dataset.rows
+    assert len(rows) == len(STREETS) * SCANS
+    assert dataset.losses == {}
+    errors = pd.concat(
+        pd.read_parquet(path).assign(group=path.parent.name)
+        for path in (done[0] / "tables" / "errors").rglob("*.parquet")
+    ).reset_index(drop=True)
+    for row in rows.itertuples():
+        near = errors[errors["group"] == row.group]
+        nearest = ((near["x"] - row.x) ** 2 + (near["y"] - row.y) ** 2).idxmin()
+        assert row.error_mean == near.loc[nearest, "error_mean"]
+    assert len(errors) == len(rows)
+    assert dataset.made_with["sensor"]["name"] == "VLP16"
+    assert set(dataset.data_sets) == set(STREETS)
+
+
+def test_the_run_tells_what_it_did(done: tuple[Path, Told]) -> None:
+    told = json.loads((done[0] / "run.json").read_text())
+    assert told["state"] == "done"
+    assert told["failures"] == {}
+    assert told["labelled"] == len(STREETS) * SCANS
+    stages = told["stages"]
+    assert stages["register"]["work"] == len(STREETS) * SCANS
+    assert stages["predict"]["work"] == len(STREETS) * SCANS
+    assert stages["train"] | {"core_seconds": 0} == {
+        "tasks": 1,
+        "failed": 0,
+        "work": 1,
+        "core_seconds": 0,
+    }
+    effective = yaml.safe_load((done[0] / "config.yaml").read_text())
+    assert RunSettings(**effective) == RunSettings(**effective | {"spacing": 1.0})
+    assert effective["label"]["starts"]["radius"] == 0.4
+
+
+def test_the_evaluation_has_every_protocol_and_opponent(done: tuple[Path, Told]) -> None:
+    found = json.loads((done[0] / "tables" / "evaluation.json").read_text())
+    protocols = pd.DataFrame(found["protocols"])
+    judged = protocols[protocols["reason"] == ""]
+    assert set(judged["model"]) == set(models.COMPETITORS)
+    assert {"paper", "path"} <= set(judged["protocol"])
+    for row in judged.itertuples():
+        assert 0.0 <= row.mae <= row.rmse
+    sets = set(pd.DataFrame(found["table_iv"])["factors"])
+    assert sets == {"FS", "FS+RQ", "FS+RQ+LY", "FS+RQ+LY+LS", "all + robust"}
+    assert {row["target"] for row in found["parts"]} == {"error_tail", "p_fail"}
+    assert found["ceilings"] == {}
+
+
+def test_held_out_estimates_stand_beside_the_labels(done: tuple[Path, Told]) -> None:
+    report = json.loads((done[0] / "report" / "report.json").read_text())
+    assert {path["path"] for path in report["paths"]} == set(STREETS)
+    held = pd.read_parquet(done[0] / "tables" / "judged" / "error_mean-default-all.parquet")
+    part = held[held["protocol"] == "path"]
+    assert len(part) == len(STREETS) * SCANS
+    for fold, rows in part.groupby("fold"):
+        assert fold == f"path {rows['path'].iloc[0]}"
+        assert set(rows["path"]) == {fold.removeprefix("path ")}
+
+
+def test_tiles_do_not_wait_for_each_other(done: tuple[Path, Told]) -> None:
+    order = [outcome.key for outcome in done[1].outcomes]
+    merges = [n for n, key in enumerate(order) if key.startswith("merge-")]
+    cells = [n for n, key in enumerate(order) if key.startswith("cells-")]
+    assert merges
+    assert cells
+    # One process runs them in the order of the plan; what counts is that nothing but its own tile
+    # stands between a cells task and its start.
+    tasks = {key: n for n, key in enumerate(order)}
+    for key in order:
+        if key.startswith("cells-"):
+            tile = key.split("-", 2)[2]
+            assert tasks[f"merge-{tile}"] < tasks[key]
+
+
+# --- Again
+
+
+def test_a_second_run_redoes_nothing(inputs: Path, copy: Path) -> None:
+    before, told = hashes(copy), Told()
+    ts.run(job(inputs, copy), watch=told)
+    assert told.worked() == set()
+    assert hashes(copy) == before
+
+
+def test_another_seed_redoes_the_models_only(inputs: Path, copy: Path) -> None:
+    told = Told()
+    ts.run(job(inputs, copy, model={"seed": 7}), watch=told)
+    assert told.worked() == {"judge", "weigh", "train", "predict"}
+
+
+def test_another_matcher_redoes_the_labels_and_what_is_learnt(inputs: Path, copy: Path) -> None:
+    told = Told()
+    label = {"matcher": "autoware", "starts": {"radius": 0.4, "step": 0.2}}
+    ts.run(job(inputs, copy, label=label), watch=told)
+    assert told.worked() == {"register", "label", "join", "judge", "weigh", "train", "predict"}
+    assert ts.dataset(copy).data_sets["canyon"]["registration"]["solver"] == "raw"
+
+
+def test_a_drive_that_is_left_out_leaves_nothing_behind(inputs: Path, copy: Path) -> None:
+    drives = [{"log": str(inputs / f"{kind}.mcap")} for kind in ("canyon", "tunnel")]
+    ts.run(job(inputs, copy, drives=drives))
+    assert set(ts.dataset(copy).rows["group"]) == {"canyon", "tunnel"}
+    assert {p.name for p in (copy / "tables" / "errors").iterdir()} == {"canyon", "tunnel"}
+    places = pd.read_parquet(copy / "report" / "places.parquet")
+    assert set(places["route_id"]) == {"canyon", "tunnel"}
+
+
+def test_a_changed_block_redoes_what_sees_it(inputs: Path, copy: Path, tmp_path: Path) -> None:
+    changed = tmp_path / "changed"
+    shutil.copytree(inputs, changed)
+    ts.run(job(changed, tmp_path / "run"))
+    streets.write_pcd(changed / "map_tunnel.pcd", streets.street("tunnel", 2, 0.3))
+    told = Told()
+    ts.run(job(changed, tmp_path / "run"), watch=told)
+    redone = {o.key.split("-")[1] for o in told.outcomes if o.stage == "register" and o.result}
+    assert redone == {"tunnel"}
+    tiles = {
+        int(o.key.split("-", 1)[1].split("_")[0])
+        for o in told.outcomes
+        if o.stage == "factors" and o.result
+    }
+    assert tiles
+    assert tiles <= {7, 8, 9}  # the tunnel begins at x = 400 m; tiles are 50 m wide
+
+
+# --- What fails
+
+
+def test_a_task_that_fails_keeps_nothing_else_from_its_end(
+    inputs: Path, copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain = estimate_tasks.predict
+
+    def failing(model: training.Model, factors: pd.DataFrame, made: object) -> pd.DataFrame:
+        if (factors["route_id"] == "tunnel").any():
+            raise ModelError("cannot be estimated here")
+        return plain(model, factors, made)
+
+    monkeypatch.setattr(estimate_tasks, "predict", failing)
+    with pytest.raises(PartialError, match="cannot be estimated here"):
+        ts.run(job(inputs, copy, model={"seed": 3}))
+    told = json.loads((copy / "run.json").read_text())
+    assert told["state"] == "failed"
+    assert all(key.startswith("predict-") for key in told["failures"])
+    places = pd.read_parquet(copy / "report" / "places.parquet").set_index("route_id")
+    assert places.loc["tunnel", "estimate"].isna().all()
+    assert places.loc["tunnel", "reason"].str.contains("task failed").all()
+    assert places.loc[["canyon", "crossing"], "estimate"].notna().all()
+
+
+def test_too_few_places_are_no_model(inputs: Path, tmp_path: Path) -> None:
+    drives = [{"log": str(inputs / "canyon.mcap")}]
+    with pytest.raises(PartialError, match=r"26 labelled points, and a model needs 50"):
+        ts.run(job(inputs, tmp_path / "run", drives=drives))
+    told = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert "train-model" in told["failures"]
+    page = (tmp_path / "run" / "report" / "index.html").read_text()
+    assert "no estimate" in page
+
+
+# --- A model that is there
+
+
+def test_a_model_is_applied_to_another_map(
+    inputs: Path, done: tuple[Path, Told], tmp_path: Path
+) -> None:
+    use = {"use": str(done[0] / "model.skops")}
+    told = Told()
+    routes = [str(inputs / "canyon.mcap")]
+    settings = job(inputs, tmp_path / "run", model=use, drives=[], routes=routes)
+    ts.run(settings, watch=told)
+    assert not {o.stage for o in told.outcomes} & {"register", "join", "train", "judge"}
+    here = pd.read_parquet(tmp_path / "run" / "report" / "places.parquet")
+    there = pd.read_parquet(done[0] / "report" / "places.parquet")
+    there = there[there["route_id"] == "canyon"].reset_index(drop=True)
+    pd.testing.assert_series_equal(here["estimate"], there["estimate"], check_exact=True)
+
+
+def test_a_model_of_another_sensor_is_refused_by_name(
+    inputs: Path, done: tuple[Path, Told], tmp_path: Path
+) -> None:
+    use = {"use": str(done[0] / "model.skops")}
+    routes = [str(inputs / "canyon.mcap")]
+    settings = job(inputs, tmp_path / "run", model=use, drives=[], routes=routes, sensor="OS1_128")
+    with pytest.raises(PartialError, match=r"sensor does not match.*VLP16.*OS1_128"):
+        ts.run(settings)
+
+
+# --- The settings
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("out: run\nmapp: {}", r"mapp is no setting: did you mean map"),
+        ("out: run\nmap: {tile_sise: 50}", r"tile_sise is no setting: did you mean tile_size"),
+        (
+            "out: run\nlabel: {starts: {radios: 1}}",
+            r"radios is no setting: did you mean radius",
+        ),
+        ("out: run\nmap: {sources: [a.pcd]}", r"nothing to learn from"),
+        ("out: run\ndrives: [{log: a.mcap}]", r"has no map"),
+        (
+            "out: run\nmap: {sources: [a.pcd]}\ndrives: [{log: x/a.mcap}, {log: y/a.mcap}]",
+            r"two drives named a",
+        ),
+        (
+            "out: run\nmap: {sources: [a.pcd]}\ndrives: [{log: a.mcap, name: ../../etc}]",
+            r"name",
+        ),
+        (
+            "out: run\nmap: {sources: [a.pcd]}\ndrives: [{log: a.mcap}]\nsensor: VLP-16",
+            r"known are VLP16",
+        ),
+        ("just words", r"give the fields of a job"),
+        ("out: [", r"no YAML"),
+    ],
+)
+def test_settings_that_cannot_be_are_named(tmp_path: Path, text: str, said: str) -> None:
+    (tmp_path / "job.yaml").write_text(text)
+    with pytest.raises(UsageError, match=said):
+        read_settings(tmp_path / "job.yaml")
+
+
+def test_changes_come_on_top_of_the_file(tmp_path: Path) -> None:
+    (tmp_path / "job.yaml").write_text("out: run\nmap: {sources: [a.pcd]}\nroutes: [r.csv]\n")
+    found = read_settings(
+        tmp_path / "job.yaml", ["model.use=m.skops", "map.tile_size=40", "spacing=2.5"]
+    )
+    assert (found.model.use, found.map.tile_size, found.spacing) == ("m.skops", 40.0, 2.5)
+    with pytest.raises(UsageError, match="give key=value"):
+        read_settings(tmp_path / "job.yaml", ["spacing"])
+    with pytest.raises(UsageError, match="out holds a value"):
+        read_settings(tmp_path / "job.yaml", ["out.x=1"])
+
+
+def test_a_log_that_is_not_there_is_named(inputs: Path, tmp_path: Path) -> None:
+    drives = [{"log": str(tmp_path / "nowhere.mcap")}]
+    with pytest.raises(SourceNotFoundError, match=r"nowhere\.mcap"):
+        ts.run(job(inputs, tmp_path / "run", drives=drives))
+
+
+# --- The commands
+
+
+@pytest.fixture
+def config(inputs: Path, done: tuple[Path, Told], tmp_path: Path) -> Path:
+    path = tmp_path / "job.yaml"
+    path.write_text(yaml.safe_dump(job(inputs, done[0]).model_dump(mode="json")))
+    return path
+
+
+def test_the_command_prints_the_headline_and_gates(
+    config: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command(["run", str(config), "--workers", "1"]) == 0
+    said = capsys.readouterr().out
+    assert "The report is at" in said
+    assert re.search(r"places\s+78", said)
+    assert command(["run", str(config), "--workers", "1", "--fail-over", "1e-6"]) == 1
+    assert "78 of 78 sample points are estimated above 1e-06 m" in capsys.readouterr().err
+    assert command(["run", str(config), "--workers", "1", "--fail-over", "99"]) == 0
+
+
+def test_the_plan_tells_stages_memory_and_cost(
+    config: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command(["plan", str(config), "--json"]) == 0
+    stages = {row["stage"]: row for row in json.loads(capsys.readouterr().out)["stages"]}
+    assert stages["factors"]["work"] == len(STREETS) * SCANS
+    assert stages["label"]["after"] == ["register"]
+    assert stages["predict"]["after"] == ["train"]
+    assert all(row["promised_bytes"] > 0 and row["core_hours"] >= 0 for row in stages.values())
+    assert command(["run", str(config), "--dry-run"]) == 0
+    assert "core-hours" in capsys.readouterr().out
+
+
+def test_a_plan_before_anything_is_there_reads_headers_only(inputs: Path, tmp_path: Path) -> None:
+    expected = forecast(job(inputs, tmp_path / "run"))
+    assert {"scatter", "cells", "terms", "factors", "register"} <= {t.stage for t in expected.tasks}
+    assert not (tmp_path / "run").exists()
+    assert any("bounds" in note or "where the points" in note for note in expected.notes)
+
+
+def test_a_job_that_does_not_fit_is_refused_before_it_runs(
+    config: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command(["run", str(config), "--workers", "1", "--set", "memory=400000000"]) == 2
+    assert "needs" in capsys.readouterr().err
+
+
+# --- What a job costs
+
+
+def test_costs_are_learnt_from_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+
+    class Work:
+        key, stage, work = "terms-1", "terms", 4
+        needs: tuple[str, ...] = ()
+        promised_bytes = 1
+
+    before = core_hours([Work()])["terms"]
+    learn([Work()], [Outcome("terms-1", "terms", 1, seconds=80.0)])
+    assert core_hours([Work()])["terms"] == pytest.approx((before + 80.0 / 3600.0) / 2.0)
+    calibration_file().write_text("{broken")
+    assert core_hours([Work()])["terms"] == before
+
+
+# --- On Dask
+
+
+@pytest.mark.slow
+def test_dask_makes_the_same_tables(inputs: Path, tmp_path: Path) -> None:
+    """In processes of their own, since here the forests are small."""
+    for name, workers in (("here", "1"), ("there", "2")):
+        path = tmp_path / f"{name}.yaml"
+        path.write_text(yaml.safe_dump(job(inputs, tmp_path / name).model_dump(mode="json")))
+        line = [sys.executable, "-m", "tilestream", "run", str(path), "--workers", workers]
+        subprocess.run(line, check=True, capture_output=True)
+    assert hashes(tmp_path / "here") == hashes(tmp_path / "there")
+    one, two = (
+        pd.read_parquet(tmp_path / name / "report" / "places.parquet") for name in ("here", "there")
+    )
+    pd.testing.assert_frame_equal(one, two, check_exact=True)
+
+
+@pytest.mark.slow
+def test_many_places_are_learnt_by_all_workers(
+    inputs: Path, done: tuple[Path, Told], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(main_job, "LARGE", 10)
+    with dask_client(None, 2, 1_500_000_000) as client:
+        ts.run(job(inputs, tmp_path / "run"), client)
+    one, two = (
+        pd.read_parquet(f / "report" / "places.parquet") for f in (done[0], tmp_path / "run")
+    )
+    pd.testing.assert_series_equal(one["estimate"], two["estimate"], check_exact=True)

@@ -1,0 +1,94 @@
+"""What a map update changes."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scenes import scene
+
+import tilestream as ts
+from tilestream.cli import run
+from tilestream.dataflow.estimate_tasks import PLACE_COLUMNS
+from tilestream.dataflow.map_diff import diff
+from tilestream.errors import StoreNotFoundError, UsageError
+from tilestream.forest.training import PREDICTION_COLUMNS
+from tilestream.formats.pcd import write_pcd
+from tilestream.tables import write_table
+
+
+def made(folder: Path, name: str, points: np.ndarray, tile_size: float = 10.0) -> Path:
+    cloud = folder / f"{name}.pcd"
+    write_pcd(cloud, points)
+    ts.ingest(cloud, folder / name / "map.zarr", tile_size=tile_size)
+    return folder / name
+
+
+def estimated(run_dir: Path, x: list[float], estimate: list[float]) -> None:
+    rows: dict[str, object] = {c.name: [0.1] * len(x) for c in PREDICTION_COLUMNS}
+    rows |= {"in_domain": [True] * len(x), "status": ["done"] * len(x), "reason": [""] * len(x)}
+    rows |= {"route_id": ["r"] * len(x), "sample": range(len(x)), "arc_length": x}
+    rows |= {"heading": [0.0] * len(x), "x": x, "y": [0.0] * len(x), "z": [2.0] * len(x)}
+    frame = pd.DataFrame(rows).assign(estimate=estimate)
+    columns = (*PLACE_COLUMNS, *PREDICTION_COLUMNS)
+    write_table(str(run_dir / "tables" / "predictions" / "0_0.parquet"), frame, columns, {})
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    folder = tmp_path_factory.mktemp("maps")
+    points = scene("canyon", 1)
+    old = made(folder, "old", points[points[:, 0] < 20.0])
+    moved = points + np.where(points[:, :1] >= 10.0, (0.0, 0.0, 0.4), 0.0)
+    more = scene("canyon", 2, offset=(20.0, 0.0, 0.0))
+    new = made(folder, "new", np.vstack([moved[moved[:, 0] < 20.0], more]))
+    estimated(old, [1.0, 2.0, 3.0, 4.0], [0.10, 0.10, 0.10, 0.30])
+    estimated(new, [1.1, 2.0, 3.0, 40.0], [0.15, 0.09, 0.30, 0.90])
+    return old, new
+
+
+def test_tiles_are_added_removed_changed_or_the_same(two: tuple[Path, Path]) -> None:
+    found = diff(*two)
+    assert {key.ix for key in found.changed} == {1}
+    assert {key.ix for key in found.added} >= {2, 3}
+    assert found.removed == ()
+    assert found.same >= 2
+    back = diff(two[1], two[0])
+    assert (back.added, back.removed) == (found.removed, found.added)
+    assert back.changed == found.changed
+    assert diff(two[0], two[0]).changed == ()
+
+
+def test_points_that_got_worse_are_listed_the_worst_first(two: tuple[Path, Path]) -> None:
+    found = diff(*two)
+    assert found.compared == 3  # the one at 40 m is new
+    assert found.worse["arc_length"].tolist() == [3.0, 1.1]
+    assert found.worse["change"].tolist() == pytest.approx([0.2, 0.05])
+    assert diff(*two, worse=0.1).worse["arc_length"].tolist() == [3.0]
+
+
+def test_stores_without_estimates_are_compared_by_tiles(two: tuple[Path, Path]) -> None:
+    found = diff(two[0] / "map.zarr", two[1] / "map.zarr")
+    assert found.changed
+    assert (found.compared, len(found.worse)) == (0, 0)
+
+
+def test_what_cannot_be_compared_is_refused(two: tuple[Path, Path], tmp_path: Path) -> None:
+    other = made(tmp_path, "other", scene("canyon", 1), tile_size=20.0)
+    with pytest.raises(UsageError, match="one tile size"):
+        diff(two[0], other)
+    with pytest.raises(StoreNotFoundError):
+        diff(two[0], tmp_path / "nothing")
+
+
+def test_the_command_tells_people_and_machines(
+    two: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["diff", str(two[0]), str(two[1]), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["compared"] == 3
+    assert [row["arc_length"] for row in told["worse"]] == [3.0, 1.1]
+    assert "1_0" in told["changed"]
+    assert run(["diff", str(two[0]), str(two[1])]) == 0
+    assert "got worse" in capsys.readouterr().out
