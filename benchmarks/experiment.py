@@ -1,0 +1,131 @@
+"""The tables of a finished run for RESULTS.md: Table I, Table IV, protocols, ceiling, cost.
+
+    tilestream run pipelines/shinjuku.yaml
+    python benchmarks/experiment.py shinjuku [--picture FILE]
+
+Everything is read from the run directory; nothing is computed anew. Lengths are centimetres.
+"""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from shinjuku_labels import LIMITS, PAPER
+
+import tilestream as ts
+from tilestream.forest.evaluation import PAPER_TABLE
+from tilestream.forest.protocols import PROTOCOLS
+
+CM = 100.0
+TITLES = {protocol.name: protocol.name for protocol in PROTOCOLS} | {
+    "paper": "random quarter (the paper's)",
+    "path": "a path left out",
+    "blocks": "blocks left out",
+}
+
+
+def markdown(rows: list[list[str]], head: list[str]) -> str:
+    """A Markdown table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def table_one(run_dir: Path) -> str:
+    """Shares of sample points beyond each limit, ours and the paper's, by drive."""
+    rows = ts.dataset(run_dir).rows
+    lines = []
+    for drive, part in rows.assign(drive=rows["group"].str.split("-").str[0]).groupby("drive"):
+        paths = dict(tuple(part.groupby("path"))) | {"all": part}
+        for name, points in paths.items():
+            error, paper = points["error_mean"], PAPER.get(str(name), ("",) * 4)
+            shares = [
+                f"{CM * (error > limit).mean():.1f}, {of_paper}"
+                for limit, of_paper in zip(LIMITS, paper, strict=True)
+            ]
+            middle = f"{CM * error.median():.1f}"
+            lines.append([str(drive), str(name), str(len(points)), middle, *shares])
+    head = ["drive", "path", "points", "median", "> 10 cm, paper", "> 15", "> 20", "> 25"]
+    return markdown(lines, head)
+
+
+def figures(row: Any) -> list[str]:
+    """The figures of a row of the evaluation."""
+    lengths = [f"{CM * row[name]:.2f}" for name in ("rmse", "mae")]
+    shares = [f"{CM * row[name]:.1f} %" for name in ("within_25mm", "within_50mm")]
+    rest = [
+        "" if pd.isna(row.get(name)) else f"{row[name]:.2f}" for name in ("r2", "skill", "spearman")
+    ]
+    return [*lengths, *shares, *rest]
+
+
+FIGURES = ["RMSE", "MAE", "< 2.5 cm", "< 5 cm", "R^2", "skill", "Spearman"]
+
+
+def table_four(evaluation: dict[str, Any]) -> str:
+    """The paper's Table IV beside ours on every protocol."""
+    lines = [["the paper", str(row["factors"]), *figures(row)] for _, row in PAPER_TABLE.iterrows()]
+    table = pd.DataFrame(evaluation["table_iv"])
+    for protocol, part in table[table["reason"] == ""].groupby("protocol", sort=False):
+        for _, row in part.iterrows():
+            name = f"{TITLES[str(protocol)]}, forest `{row['model']}`"
+            lines.append([name, str(row["factors"]), *figures(row)])
+    return markdown(lines, ["protocol", "factors", *FIGURES])
+
+
+def table_protocols(evaluation: dict[str, Any], target: str = "error_mean") -> str:
+    """Models, opponents and the repeated drive on every protocol."""
+    main = target == "error_mean"
+    table = pd.DataFrame(evaluation["protocols" if main else "parts"])
+    if not main:
+        table = table[table["target"] == target]
+    lines = []
+    for protocol, part in table[table["reason"] == ""].groupby("protocol", sort=False):
+        ranked = part.sort_values("mae")
+        lines += [
+            [TITLES[str(protocol)], str(r["model"]), *figures(r)] for _, r in ranked.iterrows()
+        ]
+    if target in evaluation["ceilings"]:
+        lines.append(["", "a repeated drive", *figures(evaluation["ceilings"][target])])
+    return markdown(lines, ["protocol", "model", *FIGURES])
+
+
+def table_cost(run: dict[str, Any]) -> str:
+    """What each stage cost."""
+    lines = [
+        [stage, f"{row['tasks']:,}", f"{row['work']:,}", f"{row['core_seconds']:,.0f}"]
+        for stage, row in run["stages"].items()
+    ]
+    return markdown(lines, ["stage", "tasks", "work", "core-seconds"])
+
+
+def main() -> None:
+    """Print the tables of a run directory."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("run_dir", type=Path)
+    given = parser.parse_args()
+    evaluation = json.loads((given.run_dir / "tables" / "evaluation.json").read_text())
+    run = json.loads((given.run_dir / "run.json").read_text())
+    print(f"## Errors\n\n{table_one(given.run_dir)}\n")
+    print(f"## Table IV\n\n{table_four(evaluation)}\n")
+    print(f"## Protocols\n\n{table_protocols(evaluation)}\n")
+    for target in ("error_tail", "p_fail"):
+        print(f"## {target}\n\n{table_protocols(evaluation, target)}\n")
+    coverage = pd.DataFrame(evaluation["coverage"])
+    lines = [
+        [
+            str(r.path),
+            str(r.points),
+            f"{CM * r.level:.0f} %",
+            f"{CM * r.covered:.0f} %",
+            f"{r.factor:.2f}",
+        ]
+        for r in coverage.itertuples()
+    ]
+    print("## Intervals\n\n" + markdown(lines, ["path", "points", "promised", "covered", "factor"]))
+    print(f"\n## Cost\n\n{table_cost(run)}\n\n{run['seconds']:.0f} s in all")
+
+
+if __name__ == "__main__":
+    main()
