@@ -449,10 +449,15 @@ def test_localize_refuses_what_cannot_be(
     assert not out.exists()
 
 
-def test_the_demo_makes_a_map(tmp_path: Path, capsys: Told) -> None:
-    assert run(["demo", "--store", str(tmp_path / "map.zarr")]) == 0
-    assert "done" in capsys.readouterr().out
-    assert ts.open_store(str(tmp_path / "map.zarr")).keys()
+@pytest.mark.slow
+def test_the_demo_ends_with_a_report(tmp_path: Path, capsys: Told) -> None:
+    assert run(["demo", "--out", str(tmp_path / "demo")]) == 0
+    page = tmp_path / "demo" / "report" / "index.html"
+    assert f"The report is at {page}" in capsys.readouterr().out
+    assert "PLATEAU" in page.read_text()
+    dataset = ts.dataset(tmp_path / "demo")
+    assert len(dataset) >= 150
+    assert set(dataset.rows["path"]) == {"I", "II", "III", "IV", "V"}
 
 
 # --- Real data

@@ -53,6 +53,7 @@ def small_forests() -> Iterator[None]:
         patch.setattr(models, "PAPER", quick)
         patch.setattr(models, "CANDIDATES", (Recipe(trees=4, leaf=2, log=True),))
         patch.setattr(training, "PAPER", quick)
+        patch.delitem(models.COMPETITORS, "mlp")  # a thousand passes over the data
         patch.setattr(evaluation.importances, "__defaults__", ("error_mean", quick, 0))
         patch.setattr(evaluation.criterion_importances, "__defaults__", ("error_mean", quick, 0))
         yield

@@ -10,7 +10,6 @@ import sys
 from dataclasses import asdict
 from importlib import resources
 from pathlib import Path
-from tempfile import mkdtemp
 from typing import Annotated, Any, Literal
 
 import pandas as pd
@@ -43,7 +42,7 @@ from tilestream.dataflow.localize_tasks import Reading
 from tilestream.dataflow.main_plan import forecast
 from tilestream.dataflow.map_diff import WORSE, diff
 from tilestream.dataflow.run import dask_client
-from tilestream.dataflow.run_settings import read_settings
+from tilestream.dataflow.run_settings import RunSettings, read_settings
 from tilestream.dataflow.simulate import SCENE_BYTES
 from tilestream.dataflow.simulate import simulate as simulate_city
 from tilestream.errors import (
@@ -418,20 +417,34 @@ def run_job(
     if dry_run:
         plan_job(config, changes, as_json=as_json)
         return
-    settings = read_settings(config, changes)
+    folder = do_job(read_settings(config, changes), scheduler, workers)
+    if as_json:
+        print_json(report_of(folder))
+    else:
+        show_report(folder)
+    if fail_over is not None:
+        judge_over(folder, fail_over)
+
+
+def do_job(settings: RunSettings, scheduler: str | None, workers: int | None) -> Path:
+    """Run the main job with progress; the run directory."""
     with dask_client(scheduler, workers, settings.memory) as client, progress() as watch:
         if client is not None:
             err.print(f"Dask dashboard: {client.dashboard_link}", highlight=False, soft_wrap=True)
-        folder = main_job.run(settings, client, watch)
-    report = json.loads((folder / "report" / "report.json").read_text())
-    if as_json:
-        print_json(report)
-    else:
-        out.print(report_table(report))
-        page = (folder / "report" / "index.html").absolute()
-        out.print(f"The report is at {page}", highlight=False, soft_wrap=True)
-    if fail_over is not None:
-        judge_over(folder, fail_over)
+        return main_job.run(settings, client, watch)
+
+
+def report_of(folder: Path) -> dict[str, Any]:
+    """The figures of a run's report."""
+    found: dict[str, Any] = json.loads((folder / "report" / "report.json").read_text())
+    return found
+
+
+def show_report(folder: Path) -> None:
+    """Print the headline of a report and where it is."""
+    out.print(report_table(report_of(folder)))
+    page = (folder / "report" / "index.html").absolute()
+    out.print(f"The report is at {page}", highlight=False, soft_wrap=True)
 
 
 def judge_over(folder: Path, limit: float) -> None:
@@ -489,17 +502,13 @@ def diff_maps(
 
 @app.command()
 def demo(
-    store: Annotated[str | None, typer.Option(help="Where to; default: a new folder.")] = None,
+    folder: Annotated[str, typer.Option("--out", help="The run directory.")] = "tilestream-demo",
+    workers: Annotated[int | None, JOB_WORKERS] = None,
 ) -> None:
-    """Ingest the small point cloud that ships with tilestream and show its tiles."""
-    place = store or str(Path(mkdtemp(prefix="tilestream-demo-")) / "map.zarr")
-    with (
-        resources.as_file(resources.files("tilestream") / "data" / "street.laz") as cloud,
-        progress() as watch,
-    ):
-        made = ingest_map.ingest(cloud, place, tile_size=20.0, watch=watch)
-    out.print(tile_table(made))
-    out.print(f"The tile store is at {place}", highlight=False, soft_wrap=True)
+    """The main job on a few streets of Shinjuku, simulated first: some minutes, no files needed."""
+    with resources.as_file(resources.files("tilestream") / "data" / "demo.yaml") as path:
+        settings = read_settings(path, [f"out={json.dumps(folder)}"])
+    show_report(do_job(settings, None, workers))
 
 
 def print_json(value: object) -> None:
