@@ -75,7 +75,8 @@ def city_map(found: Findings) -> dict[str, Any]:
             else {"color": {"field": "estimate", "transform": mapper}, "size": "size"}
         )
         glyphs = plot.scatter("x", "y", source=source, marker=marker, legend_label=name, **style)
-        plot.add_tools(_hover(glyphs, MAP_TIP, point_policy="follow_mouse"))
+        # of the dots under the mouse the worst, which is the one on top
+        plot.add_tools(_hover(glyphs, MAP_TIP, sort_by=[("estimate", -1)]))
     _number_the_worst(plot, places, origin)
     if np.isfinite(estimate).any():
         bar = ColorBar(color_mapper=mapper, title="estimated error [cm]", width=12, padding=4)
@@ -173,7 +174,7 @@ def path_chart(found: Findings, path: str) -> dict[str, Any]:
     """
     labels = found.labels[found.labels["path"].astype(str) == path]
     factor = interval_factor(found.coverage, path)
-    plot = _plot(280, "along the path [m]", "error [cm]", PATH_TOOLS, y_range=DataRange1d(start=0))
+    plot = _plot(280, "along [m]", "error [cm]", PATH_TOOLS, y_range=DataRange1d(start=0))
     columns = _estimated(labels, factor)
     _band(plot, columns)
     drives = list(labels.groupby("group", sort=True))
@@ -256,7 +257,14 @@ def _band(plot: figure, columns: dict[str, Any]) -> None:
 
 def _hover(glyphs: "GlyphRenderer[Any]", tip: Any, **options: Any) -> HoverTool:
     """Shows what is under the mouse; no button of its own in the toolbar."""
-    return HoverTool(renderers=[glyphs], tooltips=tip, visible=False, **options)
+    return HoverTool(
+        renderers=[glyphs],
+        tooltips=tip,
+        visible=False,
+        limit=1,
+        point_policy="follow_mouse",
+        **options,
+    )
 
 
 def _plot(height: int, x: str, y: str, tools: str, **options: Any) -> figure:
@@ -274,8 +282,8 @@ def _plot(height: int, x: str, y: str, tools: str, **options: Any) -> figure:
 
 
 def _finish(plot: figure) -> None:
-    """Calm; page.js lays the page's own colours under it (what is see-through is not wiped)."""
-    plot.background_fill_alpha = 0.0
+    """Calm, and see-through, so that the page's own colours stand behind."""
+    plot.background_fill_alpha = plot.border_fill_alpha = 0.0
     plot.outline_line_color = None
     plot.axis.axis_line_alpha = 0.4
     plot.axis.minor_tick_line_color = None

@@ -7,13 +7,10 @@
     const night = dark.matches && !printing.matches;
     const ink = night ? "#c9ced5" : "#3c434b";
     const line = night ? "#59616b" : "#c3c6c9";
-    const panel = night ? "#1d2126" : "#ffffff";
     for (const doc of Bokeh.documents) {
       for (const root of doc.roots()) {
         for (const model of root.references()) {
-          if (model.type === "Figure") {
-            model.setv({ border_fill_color: panel });
-          } else if (model.type === "LinearAxis") {
+          if (model.type === "LinearAxis") {
             model.setv({
               axis_label_text_color: ink, major_label_text_color: ink, axis_line_color: line,
               major_tick_line_color: line, axis_label_text_font_style: "normal",
@@ -21,7 +18,7 @@
           } else if (model.type === "Grid") {
             model.setv({ grid_line_color: line });
           } else if (model.type === "Legend") {
-            model.setv({ label_text_color: ink, inactive_fill_color: panel });
+            model.setv({ label_text_color: ink, inactive_fill_color: night ? "#1d2126" : "#ffffff" });
           } else if (model.type === "ColorBar") {
             model.setv({ title_text_color: ink, major_label_text_color: ink, title_text_font_style: "normal" });
           }

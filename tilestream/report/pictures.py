@@ -146,7 +146,7 @@ def paths_figure(found: Findings) -> Figure:
         if factor is not None:
             low, high = held / factor, held * factor
             axes.fill_between(arc, low, high, color=HELD_OUT, alpha=0.18, lw=0)
-        axes.set_title(f"path {name}", loc="left", fontsize=10)
+        axes.set_title(f"path {name}", loc="left", fontsize=10, parse_math=False)
         axes.set(ylabel="error [cm]", ylim=(0.0, None))
         axes.grid(alpha=0.25)
     panels[-1].set_xlabel("along the path [m]")
@@ -179,7 +179,9 @@ def importances_figure(importances: pd.DataFrame) -> Figure:
     axes = figure.add_subplot()
     colours = [CRITERION.get(str(c), OTHER) for c in ranked["criterion"]]
     axes.barh(np.arange(len(ranked)), ranked["importance"].to_numpy(np.float64), color=colours)
-    axes.set_yticks(np.arange(len(ranked)), ranked["factor"].astype(str), fontsize=8)
+    axes.set_yticks(
+        np.arange(len(ranked)), ranked["factor"].astype(str), fontsize=8, parse_math=False
+    )
     axes.set(xlabel="importance", ylim=(-0.6, len(ranked) - 0.4))
     axes.grid(axis="x", alpha=0.25)
     there = [c for c in CRITERION if c in set(ranked["criterion"].astype(str))]
@@ -195,7 +197,7 @@ def coverage_figure(coverage: pd.DataFrame) -> Figure:
     covered, level = (coverage[c].to_numpy(np.float64) for c in ("covered", "level"))
     axes.barh(row, covered, color=ACTUAL, height=0.6, label="inside")
     axes.plot(level, row, "|", color=HELD_OUT, ms=18, mew=2.5, label="promised")
-    axes.set_yticks(row, coverage["path"].astype(str))
+    axes.set_yticks(row, coverage["path"].astype(str), parse_math=False)
     axes.set(xlim=(0.0, 1.0), xlabel="share of the measured errors inside the interval")
     axes.legend(frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
     return figure

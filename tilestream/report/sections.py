@@ -160,7 +160,8 @@ def city_map(found: Findings, content: Mapping[str, Any]) -> str:
     meaning = (
         "Every dot is a sample point, coloured and sized by its estimated error; colours end at "
         f"the {percent(CLIP, 0)} quantile of the estimates, and what lies above has the last "
-        "colour. Point at one for its interval and reason; click a name in the legend to hide it."
+        "colour. Point at one for its interval and reason (of several, the worst is shown); click "
+        "a name in the legend to hide it."
     )
     if every > 1:
         meaning += f" Each dot stands for {every} consecutive sample points and shows the worst."

@@ -18,7 +18,7 @@ from tilestream.report.exports import (
     write_json,
     write_text,
 )
-from tilestream.report.findings import Findings
+from tilestream.report.findings import Findings, estimates
 from tilestream.report.judgement import check_threshold
 from tilestream.report.page import page
 from tilestream.report.summary import plain, summary
@@ -90,8 +90,9 @@ def _write_figures(folder: Path, findings: Findings, worst: Mapping[int, bytes |
     """Write what there is to draw; the names of the files."""
     drawn: dict[str, Callable[[], Figure]] = {
         "map.png": lambda: pictures.map_figure(findings),
-        "distribution.png": lambda: pictures.distribution_figure(findings),
     }
+    if len(findings.labels) or np.isfinite(estimates(findings.places)).any():
+        drawn["distribution.png"] = lambda: pictures.distribution_figure(findings)
     if len(findings.labels):
         drawn["paths.png"] = lambda: pictures.paths_figure(findings)
     if len(findings.importances):

@@ -1,0 +1,211 @@
+"""Findings made up for tests of the report: cheap, smooth, and with everything that can happen."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from tilestream.forest.models import FORESTS, OPPONENTS
+from tilestream.records import Float64
+from tilestream.report.findings import Findings
+
+ORIGIN = (368_000.0, 3_950_000.0, 40.0)
+LENGTHS = {"I": 300, "II": 160}
+HOSTILE = "</script><script>fail()</script><img src=x onerror=fail()> $$x$$ 'ö\"&amp;"
+
+
+def places_of(lengths: dict[str, int], seed: int = 0) -> pd.DataFrame:
+    """Routes side by side: smooth estimates, some missing, some outside of the domain."""
+    rng = np.random.default_rng(seed)
+    parts = []
+    for k, (route, n) in enumerate(lengths.items()):
+        step = np.arange(n, dtype=float)
+        wave = np.sin(step / 17.0 + k) + 0.5 * np.sin(step / 5.0)
+        estimate = 0.12 * np.exp(0.6 * wave + 0.05 * rng.normal(size=n))
+        missing = rng.random(n) < 0.05 if n > 20 else np.zeros(n, bool)
+        estimate[missing] = np.nan
+        inside = rng.random(n) > 0.1
+        parts.append(
+            pd.DataFrame(
+                {
+                    "route_id": route,
+                    "sample": np.arange(n),
+                    "arc_length": step,
+                    "heading": 0.0,
+                    "x": ORIGIN[0] + step,
+                    "y": ORIGIN[1] + 100.0 * k + 8.0 * np.sin(step / 30.0),
+                    "z": ORIGIN[2],
+                    "feature_count": rng.integers(1, 900, n).astype(float),
+                    "estimate": estimate,
+                    "low": estimate / 2.5,
+                    "high": estimate * 2.5,
+                    "p_fail": np.clip(estimate - 0.1, 0.0, 1.0),
+                    "floor": 0.5 * estimate,
+                    "tail": 0.5 * estimate,
+                    "along": 0.8 * estimate,
+                    "across": 0.5 * estimate,
+                    "up": 0.2 * estimate,
+                    "domain_distance": np.where(inside, 1.0, 9.0),
+                    "in_domain": inside & ~missing,
+                    "status": np.where(missing, "missing", "done"),
+                    "reason": np.where(
+                        missing, "no estimate: FDOP is not a number", "few features in view"
+                    ),
+                }
+            )
+        )
+    return pd.concat(parts, ignore_index=True)
+
+
+def labels_of(places: pd.DataFrame, groups: tuple[str, ...], seed: int = 1) -> pd.DataFrame:
+    """Measured errors round the estimates, with a hole of 40 m in each path."""
+    rng = np.random.default_rng(seed)
+    known = places[places["estimate"].notna()]
+    known = known[(known["arc_length"] < 60.0) | (known["arc_length"] > 100.0)]
+    parts = []
+    for group in groups:
+        noise = np.exp(0.2 * rng.normal(size=len(known)))
+        parts.append(
+            pd.DataFrame(
+                {
+                    "group": group,
+                    "path": known["route_id"].to_numpy(),
+                    "block": known["route_id"].to_numpy() + "#00",
+                    "arc_length": known["arc_length"].to_numpy(),
+                    "error_mean": known["estimate"].to_numpy() * noise,
+                    "held_out": known["estimate"].to_numpy() * 1.1,
+                }
+            )
+        )
+    return pd.concat(parts, ignore_index=True)
+
+
+def judged_by(models: list[str], protocols: tuple[str, ...]) -> pd.DataFrame:
+    """Rows as `evaluation.compare` returns them; the last protocol cannot be followed."""
+    rows: list[dict[str, Any]] = []
+    for number, protocol in enumerate(protocols[:-1]):
+        for k, model in enumerate(models):
+            error = 0.01 * (number + 1) + 0.004 * k
+            rows.append(
+                {
+                    "protocol": protocol, "model": model, "points": 400, "rmse": 1.5 * error,
+                    "mae": error, "within_25mm": 0.6, "within_50mm": 0.9, "r2": 0.5, "skill": 0.4,
+                    "spearman": 0.7 if k else float("nan"), "reason": "",
+                }
+            )  # fmt: skip
+    rows.append({"protocol": protocols[-1], "reason": "one block only"})
+    return pd.DataFrame(rows)
+
+
+def cloud_around(x: float, y: float, z: float) -> Float64:
+    """A road with two walls."""
+    along, across = np.meshgrid(np.arange(-40.0, 40.0, 0.5), np.arange(-6.0, 6.0, 0.5))
+    road = np.column_stack([along.ravel(), across.ravel(), np.full(along.size, -2.0)])
+    wall = np.meshgrid(np.arange(-40.0, 40.0, 0.5), np.arange(-2.0, 12.0, 0.5))
+    sides = [
+        np.column_stack([wall[0].ravel(), np.full(wall[0].size, side), wall[1].ravel()])
+        for side in (-9.0, 9.0)
+    ]
+    points: Float64 = np.concatenate([road, *sides]) + np.array([x, y, z])
+    return points
+
+
+def whole(seed: int = 0) -> Findings:
+    """Findings with every part filled in."""
+    places = places_of(LENGTHS, seed)
+    labels = labels_of(places, ("morning", "noon"))
+    models = [*FORESTS, *OPPONENTS]
+    table = pd.concat(
+        [
+            judged_by(["paper"], ("paper", "path", "blocks")).assign(factors=name)
+            for name in ("FS", "FS+RQ", "FS+RQ+LY", "FS+RQ+LY+LS")
+        ],
+        ignore_index=True,
+    )
+    return Findings(
+        title="Two streets",
+        places=places,
+        labels=labels,
+        protocols=judged_by(models, ("paper", "path", "blocks")),
+        table_iv=table,
+        importances=pd.DataFrame(
+            {
+                "factor": ["bhatt_sim", "FDOP", "euclidean_dist", "feature_count"],
+                "criterion": ["LS", "LY", "RQ", "FS"],
+                "importance": [0.5, 0.3, 0.15, 0.05],
+            }
+        ),
+        criterion_importances=pd.DataFrame(
+            {
+                "criterion": ["FS", "LS"],
+                "factors": [8, 4],
+                "increase": [0.004, 0.012],
+                "spread": [0.001, 0.002],
+            }
+        ),
+        coverage=pd.DataFrame(
+            {
+                "path": ["I", "II"],
+                "points": [480, 220],
+                "level": [0.9, float("nan")],
+                "covered": [0.93, float("nan")],
+                "factor": [2.5, float("nan")],
+            }
+        ),
+        ceiling={
+            "points": 480,
+            "rmse": 0.02,
+            "mae": 0.011,
+            "within_25mm": 0.9,
+            "within_50mm": 0.97,
+            "r2": 0.9,
+            "skill": 0.7,
+            "spearman": float("nan"),
+        },
+        facts={
+            "versions": {"tilestream": "0.1", "numpy": "2"},
+            "seconds": 12.5,
+            "lost": {},
+            "nothing": float("inf"),
+            "notes": ["The preset is not calibrated."],
+            "attributions": ["Buildings: somebody."],
+        },
+        crs="EPSG:32654",
+        around=cloud_around,
+    )
+
+
+def without_labels() -> Findings:
+    """What a run without a drive knows."""
+    return Findings(title="No drive", places=places_of({"only": 80}))
+
+
+def one_place() -> Findings:
+    """The least that can be reported."""
+    return Findings(title="One place", places=places_of({"spot": 1}), around=cloud_around)
+
+
+def nothing_estimated() -> Findings:
+    """Places without any estimate."""
+    found = without_labels()
+    return replace(found, places=found.places.assign(estimate=np.nan, reason="no map here"))
+
+
+def hostile() -> Findings:
+    """Names and reasons from files that are out to be run."""
+    found = whole()
+    places = found.places.replace({"route_id": {"I": HOSTILE}})
+    labels = found.labels.replace({"path": {"I": HOSTILE}, "group": {"noon": HOSTILE}})
+    return replace(
+        found,
+        title=HOSTILE,
+        places=places.assign(reason=HOSTILE),
+        labels=labels,
+        protocols=found.protocols.replace({"reason": {"one block only": HOSTILE}}),
+        table_iv=found.table_iv.replace({"factors": {"FS": HOSTILE}}),
+        importances=found.importances.assign(factor=HOSTILE, criterion=HOSTILE),
+        criterion_importances=found.criterion_importances.assign(criterion=HOSTILE),
+        coverage=found.coverage.replace({"path": {"I": HOSTILE}}),
+        facts={HOSTILE: {HOSTILE: HOSTILE}, "notes": [HOSTILE], "attributions": [HOSTILE]},
+    )

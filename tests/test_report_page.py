@@ -1,0 +1,351 @@
+"""The page: its sections, its chart data, and what a browser makes of it without a network."""
+
+import html
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from chromium import Page, chromium_page
+from report_findings import (
+    HOSTILE,
+    hostile,
+    nothing_estimated,
+    one_place,
+    places_of,
+    whole,
+    without_labels,
+)
+from report_json import charts, source
+
+from tilestream.forest.models import COMPETITORS
+from tilestream.forest.protocols import PROTOCOLS
+from tilestream.report import Findings, write_report
+from tilestream.report.judgement import worst_places
+from tilestream.report.page import CONTENTS
+from tilestream.report.sections import MODELS, PAPER_IMPORTANCES, PROTOCOL_NAMES
+from tilestream.report.words import length, span
+
+LIMIT = 0.15
+TAGS = re.compile(r"<(script|style)[^>]*>.*?</\1>|<[^>]*>", re.DOTALL)
+
+
+@pytest.fixture(scope="module")
+def found() -> Findings:
+    return whole()
+
+
+@pytest.fixture(scope="module")
+def page(found: Findings, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("report")
+    write_report(found, folder, threshold=LIMIT)
+    return folder / "index.html"
+
+
+@pytest.fixture(scope="module")
+def others(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Pages of findings that lack or have too much of something."""
+    made = {}
+    for make in (without_labels, one_place, nothing_estimated, hostile):
+        folder = tmp_path_factory.mktemp(make.__name__)
+        write_report(replace(make(), around=None), folder)
+        made[make.__name__] = folder / "index.html"
+    return made
+
+
+def text_of(page: Path, section: str) -> str:
+    """What a person reads in a section."""
+    source = page.read_text(encoding="utf-8")
+    (inner,) = re.findall(rf'<section id="{section}">(.*?)</section>', source, re.DOTALL)
+    return " ".join(html.unescape(TAGS.sub(" ", inner)).replace("\u202f", " ").split())
+
+
+@pytest.mark.parametrize("name", ["whole", "without_labels", "one_place", "nothing_estimated"])
+def test_every_section_is_there_in_order_and_says_something(
+    name: str, page: Path, others: dict[str, Path]
+) -> None:
+    path = page if name == "whole" else others[name]
+    there = re.findall(r'<section id="([^"]+)">', path.read_text())
+    assert there == [anchor for anchor, _ in CONTENTS]
+    for section in there:
+        assert len(text_of(path, section)) > 80, section
+
+
+def test_what_is_empty_says_why(others: dict[str, Path]) -> None:
+    bare = others["without_labels"]
+    for section, why in (
+        ("worst", "made without the map"),
+        ("paths", "No place was labelled"),
+        ("importances", "No forest was trained"),
+        ("table-iv", "no labels to judge"),
+        ("calibration", "no interval can be checked"),
+        ("protocols", "nothing can be judged"),
+    ):
+        assert why in text_of(bare, section), section
+    assert "No place has an estimate" in text_of(others["nothing_estimated"], "worst")
+    assert "no map here 80" in text_of(others["nothing_estimated"], "headline")
+
+
+def test_the_headline_is_in_figures_that_a_person_reads(found: Findings, page: Path) -> None:
+    text = text_of(page, "headline")
+    estimate = found.places["estimate"].dropna()
+    for figure in (
+        f"{estimate.median() * 100:.1f} cm median",
+        f"{estimate.quantile(0.95) * 100:.1f} cm 95 %",
+        f"{estimate.max() * 100:.1f} cm the highest",
+        f"{(estimate > LIMIT).mean() * 100:.1f} % of the places over 15 cm",
+        f"{found.places['estimate'].isna().sum()} places without an estimate",
+        "458 m of road, 460 sample points",
+    ):
+        assert figure in text
+
+
+def test_the_map_holds_every_place_once(found: Findings, page: Path) -> None:
+    chart = charts(page)["city-map"]
+    places = found.places.set_index(["route_id", "arc_length"])
+    labels = dict(re.findall(r'"axis_label": "([xy]) \[m\] from (\d+)"', json.dumps(chart)))
+    origin = np.array([float(labels["x"]), float(labels["y"])])
+    seen = set()
+    for kind in ("in_domain", "outside", "missing"):
+        data = source(chart, kind)
+        assert (np.diff(data["estimate"]) >= 0.0).all() or kind == "missing"
+        for k, name in enumerate(zip(data["route"], data["arc"].tolist(), strict=True)):
+            place = places.loc[name]
+            seen.add(name)
+            at = np.array([data["x"][k], data["y"][k]]) + origin
+            assert at.tolist() == pytest.approx([place["x"], place["y"]], abs=1e-6)
+            assert data["reason"][k] == place["reason"]
+            assert data["interval"][k] == span(place["low"], place["high"])
+            if kind == "missing":
+                assert np.isnan(place["estimate"])
+                assert data["domain"][k] == "not known"
+            else:
+                assert data["estimate"][k] == pytest.approx(100.0 * place["estimate"])
+                assert place["in_domain"] == (kind == "in_domain")
+    assert seen == set(places.index)
+    worst = source(chart, "worst")
+    rows = worst_places(found.places)
+    assert worst["number"] == [str(k) for k in range(1, 11)]
+    np.testing.assert_allclose(worst["x"] + origin[0], found.places["x"].iloc[rows])
+
+
+def test_the_path_charts_hold_measured_and_estimated(found: Findings, page: Path) -> None:
+    chart = charts(page)["path-0"]
+    here = found.labels[found.labels["path"] == "I"]
+    for group in ("morning", "noon"):
+        data, part = source(chart, group), here[here["group"] == group]
+        kept = np.isfinite(data["arc"])
+        np.testing.assert_array_equal(data["arc"][kept], part["arc_length"])
+        np.testing.assert_allclose(data["measured"][kept], 100.0 * part["error_mean"])
+        (gap,) = np.flatnonzero(~kept)
+        assert data["arc"][gap + 1] - data["arc"][gap - 1] > 40.0
+    data = source(chart, "estimate")
+    kept = np.isfinite(data["arc"])
+    one = here[here["group"] == "noon"]
+    np.testing.assert_allclose(data["estimate"][kept], 100.0 * one["held_out"])
+    np.testing.assert_allclose(data["low"][kept], 100.0 * one["held_out"] / 2.5)
+    np.testing.assert_allclose(data["high"][kept], 100.0 * one["held_out"] * 2.5)
+    assert not np.isfinite(source(charts(page)["path-1"], "estimate")["high"]).any()
+
+
+def test_the_worst_places_are_told_in_words_and_pictures(found: Findings, page: Path) -> None:
+    text = text_of(page, "worst")
+    for number, row in enumerate(worst_places(found.places), start=1):
+        place = found.places.iloc[row]
+        start = f"{number} {place['route_id']} , {place['arc_length']:.0f} m along"
+        assert start in text
+        assert length(place["estimate"]).replace("\u00a0", " ") in text
+    assert page.read_text().count('src="data:image/png;base64,') == 10
+
+
+def test_table_iv_stands_beside_the_papers_and_names_the_leak(page: Path) -> None:
+    text = text_of(page, "table-iv")
+    paper = text.index("the paper, random split leaks")
+    for figures in ("FS 3.39 cm 5.75 cm 59.4 % 81.8 %", "LS 2.83 cm 4.83 cm 64.1 % 85.7 %"):
+        assert text.index(figures) > paper
+    assert "random split leaks FS 1.00 cm 1.50 cm 60.0 % 90.0 % 0.50 0.40" in text
+    assert "leave one path out FS 2.00 cm" in text
+    assert "not followed: one block only" in text
+
+
+def test_the_protocols_say_who_wins(page: Path) -> None:
+    text = text_of(page, "protocols")
+    assert "so these figures prove nothing. model" in text  # no verdict where it leaks
+    verdict = "The best forest (2.00 cm) beats the best opponent (2.80 cm, the training median"
+    assert verdict in text
+    assert "Not followed in this run: one block only." in text
+    assert "a second drive over the same places 1.10 cm 2.00 cm 90.0 % 97.0 % 0.90 0.70 –" in text
+    losing = whole().protocols
+    losing.loc[losing["model"] == "nearest training point", "mae"] = 0.001
+    from_losers = replace(whole(), protocols=losing, around=None)
+    write_report(from_losers, page.parent / "losing")
+    text = text_of(page.parent / "losing" / "index.html", "protocols")
+    assert "does not beat the best opponent (0.10 cm, the nearest training point)" in text
+
+
+def test_intervals_are_told_against_their_promise(page: Path) -> None:
+    text = text_of(page, "calibration")
+    assert "held on 1 of 1 paths" in text
+    assert "I 480 90.0 % 93.0 % f = 2.50" in text
+    assert "II 220 none none – not calibrated" in text
+
+
+def test_facts_notes_and_attributions_are_told(page: Path) -> None:
+    text = text_of(page, "facts")
+    for told in ("numpy 2", "seconds 12.5", "nothing –", "CRS EPSG:32654", "Notes The preset is",
+                 "Data and attributions Buildings: somebody."):  # fmt: skip
+        assert told in text
+
+
+def test_every_competitor_and_protocol_has_a_name() -> None:
+    assert set(MODELS) == set(COMPETITORS)
+    assert set(PROTOCOL_NAMES) == {protocol.name for protocol in PROTOCOLS}
+    assert sum(PAPER_IMPORTANCES.values()) == pytest.approx(1.0, abs=0.03)
+    assert len(PAPER_IMPORTANCES) == 20
+
+
+def test_nothing_that_a_file_says_becomes_markup(others: dict[str, Path]) -> None:
+    source = others["hostile"].read_text(encoding="utf-8")
+    assert "<script>fail()" not in source
+    assert "<img src=x" not in source
+    assert html.escape(HOSTILE) in source
+    assert charts(others["hostile"])["city-map"]  # no name ends the data early
+
+
+def test_the_page_asks_for_nothing_from_outside(page: Path) -> None:
+    source = page.read_text(encoding="utf-8")
+    own = re.sub(r"<script>.*?</script>", "", source, flags=re.DOTALL)
+    assert not re.findall(r'(?:src|href)="(?!data:|#)[^"]*"', own)
+    assert "url(" not in own
+    assert "@import" not in own
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Page]:
+    with chromium_page() as tab:
+        yield tab
+
+
+def opened(browser: Page, page: Path) -> Page:
+    browser.errors.clear()
+    browser.requests.clear()
+    browser.command("Network.emulateNetworkConditions", offline=True, latency=0,
+                    downloadThroughput=0, uploadThroughput=0)  # fmt: skip
+    browser.command("Emulation.setDeviceMetricsOverride", width=1280, height=900,
+                    deviceScaleFactor=1, mobile=False)  # fmt: skip
+    browser.goto(page.as_uri())
+    browser.wait_for("document.documentElement.dataset.charts")
+    return browser
+
+
+def calm(browser: Page) -> None:
+    """Nothing failed, and nothing was asked for but the file and what is inside it."""
+    assert browser.errors == []
+    assert {url.split(":", 1)[0] for url in browser.requests} <= {"file", "data", "blob"}
+    assert sum(url.startswith("file:") for url in browser.requests) == 1
+
+
+TIPS = """(() => {
+  const found = [];
+  const walk = (node) => {
+    if (node.classList && node.classList.contains("bk-Tooltip") && node.shadowRoot)
+      found.push([...node.shadowRoot.children].filter((c) => c.tagName != "STYLE")
+        .map((c) => c.innerText).join(""));
+    if (node.shadowRoot) walk(node.shadowRoot);
+    for (const child of node.children || []) walk(child);
+  };
+  walk(document.body);
+  return found.join("\\n").replaceAll("\\u00a0", " ").trim();
+})()"""
+
+
+def point_at(browser: Page, chart: str, kind: str, row: int) -> None:
+    """Move the mouse onto a row of a data source."""
+    view = f"[...Bokeh.index.roots].find((v) => document.getElementById({chart!r}).contains(v.el))"
+    browser.wait_for(f"{view}.frame.bbox.width > 100")
+    browser.evaluate(f"{view}.el.scrollIntoView({{block: 'center', behavior: 'instant'}})")
+    y = "anchor" if kind == "estimate" else "y"
+    x, y = browser.evaluate(
+        f"""(() => {{
+          const view = {view};
+          const found = [...view.model.references()].find((m) => m.name == {kind!r});
+          const box = view.el.getBoundingClientRect();
+          const at = found.data.{"arc" if kind == "estimate" else "x"}[{row}];
+          return [box.left + view.frame.x_scale.compute(at),
+                  box.top + view.frame.y_scale.compute(found.data.{y}[{row}])];
+        }})()"""
+    )
+    browser.command("Input.dispatchMouseEvent", type="mouseMoved", x=x - 1, y=y)
+    browser.command("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
+
+
+def test_a_browser_shows_every_chart_and_answers_to_the_mouse(
+    browser: Page, found: Findings, page: Path
+) -> None:
+    tab = opened(browser, page)
+    assert tab.evaluate("document.documentElement.dataset.charts") == "3"
+    assert tab.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    data = source(charts(page)["city-map"], "in_domain")
+    top = len(data["arc"]) - 1  # drawn last, so nothing of it is hidden
+    point_at(tab, "city-map", "in_domain", top)
+    tip = tab.wait_for(TIPS)
+    assert f"{data['route'][top]}, {data['arc'][top]:.1f} m along" in tip
+    assert f"estimate {data['estimate'][top]:.1f} cm" in tip
+    for told in (data["interval"][top].replace("\u00a0", " "), "few features in view", "yes"):
+        assert told in tip
+    data = source(charts(page)["path-0"], "estimate")
+    point_at(tab, "path-0", "estimate", 30)
+    tip = tab.wait_for(f"({TIPS}).includes('measured') && {TIPS}")
+    assert f"{data['arc'][30]:.1f} m" in tip
+    assert "morning" in tip
+    assert f"{data['estimate'][30]:.1f} cm" in tip
+    calm(tab)
+
+
+@pytest.mark.parametrize("name", ["without_labels", "one_place", "nothing_estimated"])
+def test_a_browser_shows_what_lacks_something(
+    browser: Page, others: dict[str, Path], name: str
+) -> None:
+    tab = opened(browser, others[name])
+    assert tab.evaluate("document.querySelectorAll('section').length") == 9
+    calm(tab)
+
+
+def test_a_browser_runs_nothing_that_a_file_says(browser: Page, others: dict[str, Path]) -> None:
+    tab = opened(browser, others["hostile"])
+    assert tab.evaluate("document.title") == " ".join(HOSTILE.split())
+    point_at(tab, "city-map", "outside", 0)
+    tip = tab.wait_for(TIPS)
+    assert "<script>fail()</script><img src=x onerror=fail()>" in tip
+    point_at(tab, "path-0", "estimate", 5)
+    tab.wait_for(f"({TIPS}).includes('measured')")
+    calm(tab)
+
+
+def test_the_page_is_dark_where_the_reader_wants_it_dark(browser: Page, page: Path) -> None:
+    colours: dict[str, Any] = {}
+    for scheme in ("light", "dark"):
+        features = [{"name": "prefers-color-scheme", "value": scheme}]
+        browser.command("Emulation.setEmulatedMedia", features=features)
+        tab = opened(browser, page)
+        ground = tab.evaluate("getComputedStyle(document.body).backgroundColor")
+        axis = "[...Bokeh.documents[0].roots()[0].references()].find((m) => m.type=='LinearAxis')"
+        colours[scheme] = (ground, tab.evaluate(f"{axis}.major_label_text_color"))
+        calm(tab)
+    browser.command("Emulation.setEmulatedMedia", features=[])
+    assert colours["light"] != colours["dark"]
+    assert colours["dark"] == ("rgb(20, 23, 26)", "#c9ced5")
+
+
+def test_a_city_of_routes_is_listed_by_its_worst(tmp_path: Path) -> None:
+    places = places_of({f"street {k:02d}": 3 for k in range(60)})
+    write_report(Findings("Many streets", places), tmp_path)
+    text = text_of(tmp_path / "index.html", "headline")
+    assert "20 routes with lower estimates" in text
+    highest = places.loc[places["estimate"].idxmax(), "route_id"]
+    assert text.index(f"By route route length places median 95 % highest over 25 cm unlike no "
+                      f"estimate {highest}") > 0  # fmt: skip
