@@ -1,8 +1,9 @@
 """Pictures of the simulated Shinjuku: district and paths, scans and map at its special spots.
 
-    python benchmarks/figures_simulation.py [--preset paper|physical]
+    python benchmarks/figures_simulation.py [--preset paper|physical] [--labels FOLDER]
 
-Writes benchmarks/figures/simulation_*.png (needs matplotlib).
+Writes benchmarks/figures/simulation_*.png (needs matplotlib); with the folder of labels that
+shinjuku_labels.py left (`…/labels-10/drive0`) also a map of the errors.
 """
 
 import argparse
@@ -11,6 +12,7 @@ from pathlib import Path
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
+import pandas as pd
 from matplotlib.collections import LineCollection
 
 from tilestream.simulation.city import City, build_city
@@ -23,7 +25,7 @@ FIGURES = Path(__file__).resolve().parent / "figures"
 PLACES = (
     ("canyon: dense shopping street", "IV", 300),
     ("wide crossing", "I", 500),
-    ("tunnel", "III", 79),
+    ("tunnel", "V", 646),
     ("bridge", "V", 305),
     ("one-sided street", "III", 220),
 )
@@ -100,12 +102,57 @@ def spots(city: City) -> None:
     plt.close(fig)
 
 
+def errors(city: City, folder: Path, preset: str) -> None:
+    """Map of the measured errors with the special spots named, and the errors along each path."""
+    driven = [street for street in city.streets if street.driven]
+    fig = plt.figure(figsize=(17, 15))
+    grid = fig.add_gridspec(1 + len(driven), 1, height_ratios=(6, *[1] * len(driven)), hspace=0.5)
+    ax = fig.add_subplot(grid[0])
+    edges = np.stack([city.footprints.start, city.footprints.end], axis=1)
+    ax.add_collection(LineCollection(list(edges), colors="0.85", linewidths=0.4))
+    for row, street in enumerate(driven):
+        parts = [pd.read_parquet(part) for part in sorted(folder.glob(f"{street.name}/errors/*"))]
+        table = pd.concat(parts).query("status == 'done'")
+        arc, cm = table["arc_length"], 100 * table["error_mean"]
+        dots = ax.scatter(table["x"], table["y"], c=cm, s=42, cmap="turbo", vmin=0, vmax=40)
+        along = fig.add_subplot(grid[1 + row])
+        along.plot(arc, cm, "k.-", lw=0.7, ms=3)
+        along.set(xlim=(0, 1165), ylim=(0, 100), ylabel=f"{street.name} [cm]")
+        for spot in street.spots_of("tunnel", "crossing", "bridge", "one-sided"):
+            along.axvspan(spot.begin, spot.end, color=COLOURS[spot.kind], alpha=0.2, lw=0)
+            middle = (spot.begin + spot.end) / 2
+            along.text(middle, 88, spot.kind, ha="center", va="top", fontsize=8)
+            if spot.kind != "one-sided":
+                ax.annotate(
+                    f"{street.name}: {spot.kind}",
+                    street.at(np.array([middle]))[0],
+                    xytext=(14, 10),
+                    textcoords="offset points",
+                    fontsize=9,
+                    arrowprops={"arrowstyle": "-", "color": COLOURS[spot.kind]},
+                )
+    along.set_xlabel("along the path [m]")
+    fig.colorbar(dots, ax=ax, label="mean error of 317 starts [cm]", extend="max", pad=0.01)
+    everything = np.concatenate([street.xy for street in driven])
+    low, high = everything.min(axis=0) - 40, everything.max(axis=0) + 40
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+    ax.set_title(f"Measured localization error, preset {preset} (buildings: PLATEAU, CC BY 4.0)")
+    fig.savefig(FIGURES / "simulation_errors.png", dpi=60, bbox_inches="tight")
+    plt.close(fig)
+
+
 def main() -> None:
     """Draw everything."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--preset", default="physical")
-    city = build_city(load_preset(parser.parse_args().preset), check=False)
+    parser.add_argument("--labels", type=Path)
+    given = parser.parse_args()
+    city = build_city(load_preset(given.preset), check=False)
     FIGURES.mkdir(exist_ok=True)
+    if given.labels is not None:
+        errors(city, given.labels, given.preset)
     district(city)
     spots(city)
 

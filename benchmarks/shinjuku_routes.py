@@ -56,7 +56,7 @@ ROUTES = (
     ),
     (
         "III",
-        "residential street, a tunnel at its beginning, trees all along the other side",
+        "residential street, a short tunnel at its beginning, trees all along the other side",
         269,
         ((-742, -290), (-766, -150), (-790, -50), (-830, 20)),
     ),
@@ -105,7 +105,7 @@ SPOTS = {
         ("one-sided", 470, 620, "left"),
         ("bridge", 680, 700, "right"),
     ],
-    "III": [("tunnel", 2, 156, "right"), ("one-sided", 156, 268, "right")],
+    "III": [("tunnel", 2, 72, "right"), ("one-sided", 90, 268, "right")],
     "IV": [("narrow", 0, 651, "right")],
     "V": [
         ("narrow", 0, 200, "right"),

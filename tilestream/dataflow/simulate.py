@@ -1,5 +1,6 @@
 """Simulate a city: survey blocks and drive logs, in tasks per stretch of street."""
 
+import hashlib
 import json
 import shutil
 from collections.abc import Sequence
@@ -19,11 +20,12 @@ from tilestream.formats.las import write_las
 from tilestream.formats.mcap_write import write_log
 from tilestream.formats.rows import writing_whole
 from tilestream.records import Scan, Trajectory
-from tilestream.simulation.city import City, build_city, stretches
+from tilestream.simulation.city import City, build_city, data_file, stretches
 from tilestream.simulation.drive import motion_of, odometry, scans, stamps_of
 from tilestream.simulation.settings import SimulationSettings
-from tilestream.simulation.streets import Street, check_clear
+from tilestream.simulation.streets import Street, check_clear, read_streets, street_called
 from tilestream.simulation.survey import survey
+from tilestream.version import VERSION
 
 SCENE_BYTES = 1_500_000_000
 """Peak memory of the scene of a stretch with what is measured in it [bytes]."""
@@ -37,6 +39,13 @@ POSE_NS = 50_000_000
 """Between two poses of the odometry [ns]."""
 FIELDS = ("points", "intensity", "ring", "time_offset")
 """What a scan in a part file has."""
+RECORD, ROUTES = "simulation.yaml", "routes.geojson"
+"""Files that say what was simulated, and where its streets run."""
+SIMULATION_VERSION = 1
+"""Raised when the code of the simulation changes what it writes."""
+
+Size = Literal["full", "small"]
+"""How much of each path."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +116,7 @@ def simulate(
     *,
     paths: Sequence[str] | None = None,
     scans_per_point: int = 1,
-    size: Literal["full", "small"] = "full",
+    size: Size = "full",
     client: Any | None = None,
     watch: Watch | None = None,
 ) -> Path:
@@ -137,15 +146,17 @@ def simulate(
         PartialError: some tasks failed; the message lists them, the rest is there.
     """
     folder = Path(out)
-    if size == "small":
-        thin = settings.survey.model_copy(update={"rays_per_m": SMALL_RAYS})
-        settings = settings.model_copy(update={"survey": thin})
+    plan = plan_simulation(
+        settings, folder, paths=paths, scans_per_point=scans_per_point, size=size
+    )
+    settings = _sized(settings, size)
+    identity = _identity(settings, scans_per_point, size)
+    _require_same(folder, identity)
+    require_space(folder, _bytes_needed(plan, settings))
     city = _city(settings.model_dump_json())
     for street in city.streets:
         check_clear(street, city.footprints)
-    plan = plan_simulation(city, folder, paths, scans_per_point, size)
-    require_space(folder, _bytes_needed(plan, settings))
-    _begin(folder, city, plan)
+    _begin(folder, city, plan, identity)
     outcomes = execute(plan.tasks, client, watch)
     failures = {outcome.key: outcome.reason for outcome in outcomes if not outcome.ok}
     if failures:
@@ -155,18 +166,25 @@ def simulate(
 
 
 def plan_simulation(
-    city: City,
-    folder: Path,
-    paths: Sequence[str] | None,
-    scans_per_point: int,
-    size: Literal["full", "small"],
+    settings: SimulationSettings,
+    out: str | Path,
+    *,
+    paths: Sequence[str] | None = None,
+    scans_per_point: int = 1,
+    size: Size = "full",
 ) -> Plan:
-    """What will run: surveys and scans of every stretch, then a log per driven street."""
+    """What `simulate` will run: surveys and scans of every stretch, then a log per driven street.
+
+    Only the routes are read; no city is built and nothing is written. Arguments and errors as
+    there.
+    """
     if scans_per_point < 1 or scans_per_point > 64:
         raise UsageError(f"scans_per_point is {scans_per_point}: give 1 to 64")
-    settings = city.settings
+    folder, settings = Path(out), _sized(settings, size)
     text = settings.model_dump_json()
-    streets = city.streets if paths is None else tuple(city.street(name) for name in paths)
+    streets = read_streets(data_file(settings.city.routes))
+    if paths is not None:
+        streets = tuple(street_called(streets, name) for name in paths)
     tasks: list[SurveyTask | ScanTask | LogTask] = []
     logs: list[LogTask] = []
     for street in streets:
@@ -232,26 +250,68 @@ def require_space(folder: Path, needed: int) -> None:
         )
 
 
-def _begin(folder: Path, city: City, plan: Plan) -> None:
-    """Record what is simulated; refuse to mix it with another simulation."""
+def _sized(settings: SimulationSettings, size: Size) -> SimulationSettings:
+    """The settings that a size means."""
+    if size == "full":
+        return settings
+    thin = settings.survey.model_copy(update={"rays_per_m": SMALL_RAYS})
+    return settings.model_copy(update={"survey": thin})
+
+
+def _identity(settings: SimulationSettings, scans_per_point: int, size: Size) -> dict[str, Any]:
+    """All that decides what the files of a simulation hold, whatever their drive."""
+    inputs = {
+        name: hashlib.sha256(data_file(name).read_bytes()).hexdigest()
+        for name in (settings.city.footprints, settings.city.routes)
+    }
+    return {
+        "settings": settings.model_dump(mode="json", exclude={"drive", "note"}),
+        "scans_per_point": scans_per_point,
+        "size": size,
+        "inputs_sha256": inputs,
+        "tilestream": VERSION,
+        "simulation_version": SIMULATION_VERSION,
+    }
+
+
+def _require_same(folder: Path, identity: dict[str, Any]) -> None:
+    """Refuse to mix two simulations.
+
+    Raises:
+        UsageError: the folder holds one with another identity; names what differs.
+    """
+    record = folder / RECORD
+    if not record.exists():
+        return
+    try:
+        known = yaml.safe_load(record.read_text())
+        there = {name: known.get(name) for name in identity}
+    except (yaml.YAMLError, AttributeError):
+        raise UsageError(f"{record} is no record of a simulation: give another directory") from None
+    other = [f"{name} {there[name]}" for name in identity if there[name] != identity[name]]
+    if other:
+        raise UsageError(
+            f"{folder} holds another simulation, with {'; '.join(other)} ({record}): give another "
+            "directory"
+        )
+
+
+def _begin(folder: Path, city: City, plan: Plan, identity: dict[str, Any]) -> None:
+    """Make the folders; write what is simulated, and the routes."""
     for part in {Path(task.path).parent for task in plan.tasks if isinstance(task, _Stretch)}:
         part.mkdir(parents=True, exist_ok=True)
-    city_of = city.settings.model_dump(mode="json", exclude={"drive"})
-    record = folder / "simulation.yaml"
-    if record.exists() and yaml.safe_load(record.read_text())["settings"] != city_of:
-        raise UsageError(
-            f"{folder} holds a simulation with other settings ({record}): give another directory"
-        )
-    facts = {
-        "settings": city_of,
+    facts = identity | {
+        "note": city.settings.note,
         "buildings": len(city.footprints.height),
         "buildings_left_out": dict(city.footprints.refused),
         "attribution": city.footprints.attribution,
     }
-    record.write_text(yaml.safe_dump(facts, sort_keys=True, allow_unicode=True))
     features = [_feature(street, city) for street in city.streets]
     routes = {"type": "FeatureCollection", "features": features}
-    (folder / "routes.geojson").write_text(json.dumps(routes) + "\n")
+    with writing_whole(folder / ROUTES) as file:
+        file.write(f"{json.dumps(routes)}\n".encode())
+    with writing_whole(folder / RECORD) as file:
+        file.write(yaml.safe_dump(facts, sort_keys=True, allow_unicode=True).encode())
 
 
 def _feature(street: Street, city: City) -> dict[str, Any]:
@@ -265,7 +325,12 @@ def _feature(street: Street, city: City) -> dict[str, Any]:
         "spots": [vars(spot) for spot in street.spots],
     }
     geometry = {"type": "LineString", "coordinates": np.round(line, 3).tolist()}
-    return {"type": "Feature", "properties": properties, "geometry": geometry}
+    return {
+        "type": "Feature",
+        "id": street.name,
+        "properties": properties,
+        "geometry": geometry,
+    }
 
 
 @lru_cache(maxsize=1)
@@ -311,11 +376,13 @@ def _log(task: LogTask) -> int:
     stamps = stamps_of(motion, settings, task.scans_per_point)
     origin = round(stamps[0].mean())
     seen = stamps[: task.end].ravel()
-    every = np.arange(seen[0], seen[-1] + POSE_NS, POSE_NS)
-    # The truth has a pose at each scan besides: more than the odometry, so readers take it.
+    every = np.arange(seen[0], seen[-1] + 2 * POSE_NS, POSE_NS)
+    # The truth also has a pose at each scan and half-way: more than the odometry, so readers that
+    # are told no topic take it.
+    often = np.unique(np.concatenate([seen, every, every[:-1] + POSE_NS // 2]))
     believed, truth = (
         Trajectory(times, motion.pose(city.ground, motion.arc_at((times - origin) / 1e9)), "lidar")
-        for times in (every, np.unique(np.concatenate([seen, every])))
+        for times in (every, often)
     )
     part = Path(task.path).with_suffix(".part")
     write_log(part, _parts(task), odometry(city, believed, street), truth=truth)

@@ -12,14 +12,19 @@ from pathlib import Path
 
 import numpy as np
 
-from tilestream.errors import UsageError
 from tilestream.records import Float64
 from tilestream.simulation import buildings, furniture, structures
 from tilestream.simulation.footprints import Footprints, read_footprints
 from tilestream.simulation.ground import Ground
 from tilestream.simulation.mesh import Mesh, joined
 from tilestream.simulation.settings import SimulationSettings
-from tilestream.simulation.streets import Street, check_clear, free_space, read_streets
+from tilestream.simulation.streets import (
+    Street,
+    check_clear,
+    free_space,
+    read_streets,
+    street_called,
+)
 
 REACH = 115.0
 """How far around a stretch the city is built [m]: a lidar's range and some more."""
@@ -44,11 +49,7 @@ class City:
         Raises:
             UsageError: there is none; names those that are.
         """
-        for street in self.streets:
-            if street.name == name:
-                return street
-        known = ", ".join(street.name for street in self.streets)
-        raise UsageError(f"no street is called {name}; there are {known}")
+        return street_called(self.streets, name)
 
     def scene(self, along: Float64, epoch: int) -> Mesh:
         """All that stands still around a stretch of street.
@@ -82,10 +83,12 @@ def build_city(settings: SimulationSettings, check: bool = True) -> City:
         SourceError: footprints or routes that cannot be read.
         UsageError: a route that comes too near to a building.
     """
-    streets = read_streets(_data(settings.city.routes))
+    streets = read_streets(data_file(settings.city.routes))
     everything = np.concatenate([street.xy for street in streets])
     low, high = everything.min(axis=0) - MARGIN, everything.max(axis=0) + MARGIN
-    footprints = read_footprints(_data(settings.city.footprints)).within(tuple(low), tuple(high))
+    footprints = read_footprints(data_file(settings.city.footprints)).within(
+        tuple(low), tuple(high)
+    )
     if check:
         for street in streets:
             check_clear(street, footprints)
@@ -98,6 +101,7 @@ def stretches(street: Street, length: int = 50) -> Sequence[tuple[int, int]]:
     return [(i, min(i + length, len(street.xy))) for i in range(0, len(street.xy), length)]
 
 
-def _data(name: str) -> Path:
+def data_file(name: str) -> Path:
+    """A file of the user's, or one that ships with tilestream."""
     shipped = Path(str(resources.files("tilestream") / "data" / name))
     return Path(name) if Path(name).exists() or not shipped.is_file() else shipped

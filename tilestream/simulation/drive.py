@@ -68,7 +68,7 @@ def road(ground: Ground, xy: Float64) -> Float64:
 
 def motion_of(street: Street, settings: SimulationSettings, height: float) -> Motion:
     """A drive whose speed varies smoothly between 65 % and 100 % of the largest."""
-    rng = stream(settings.seed, "speed", settings.drive, _number(street))
+    rng = stream(settings.seed, "speed", settings.drive, street.number)
     phase, length = rng.uniform(0.0, 2 * np.pi, 3), rng.uniform(40.0, 150.0, 3)
     wave = np.sin(street.arc[:, None] * 2 * np.pi / length + phase).mean(axis=1)
     speed = settings.lidar.speed * (0.825 + 0.175 * wave)
@@ -79,7 +79,7 @@ def motion_of(street: Street, settings: SimulationSettings, height: float) -> Mo
 def stamps_of(motion: Motion, settings: SimulationSettings, scans_per_point: int) -> Int64:
     """(n, s) stamps of the scans of each sample point [ns]: s turns around its passing."""
     period = 1.0 / settings.lidar.model.rate_hz
-    begin = EPOCH_NS + settings.drive * DAY_NS + _number(motion.street) % 20 * (DAY_NS // 24)
+    begin = EPOCH_NS + settings.drive * DAY_NS + motion.street.number % 20 * (DAY_NS // 24)
     turns = (np.arange(scans_per_point) - (scans_per_point - 1) / 2) * period
     return begin + np.rint((motion.time[:, None] + turns) * 1e9).astype(np.int64)
 
@@ -115,7 +115,7 @@ def scans(
             heading = street.heading(arc[0] + np.array([-0.05, 0.05]))
             turned = float(np.angle(np.exp(1j * (heading[1] - heading[0]))))
             moving = Scene(traffic.mesh(city.ground, arc[0], since), still.origin)
-            seed = (settings.seed, settings.drive, _number(street), point * 64 + turn)
+            seed = (settings.seed, settings.drive, street.number, point * 64 + turn)
             yaw_rate = turned / 0.1 * speed
             targets = (still, moving)
             yield measure(targets, step[1], velocity, yaw_rate, settings.lidar, stamp, seed)
@@ -156,13 +156,13 @@ def traffic_of(
     street: Street, settings: SimulationSettings, epoch: int, share: float = 1.0
 ) -> Traffic:
     """The traffic of a street on one day: cars in both directions, people on both pavements."""
-    rng = stream(settings.seed, "traffic", epoch, _number(street))
     hundreds = (len(street.xy) + 2 * AHEAD) / 100.0
     n_cars = round(settings.traffic.cars_per_100m * hundreds * share)
     n_people = round(settings.traffic.people_per_100m * hundreds * share)
     table = []
-    for count, least, slow, fast in ((n_cars, LANE, 4.0, 11.0), (n_people, 2.8, 0.6, 1.6)):
-        draws = rng.uniform(size=(count, 5))
+    kinds = (("cars", n_cars, LANE, 4.0, 11.0), ("people", n_people, 2.8, 0.6, 1.6))
+    for kind, count, least, slow, fast in kinds:
+        draws = stream(settings.seed, kind, epoch, street.number).uniform(size=(count, 5))
         side = np.where(draws[:, 1] < 0.5, 1.0, -1.0)
         arc = draws[:, 0] * hundreds * 100.0 - AHEAD
         speed = -side * (slow + (fast - slow) * draws[:, 2])
@@ -173,7 +173,7 @@ def traffic_of(
 def odometry(city: City, truth: Trajectory, street: Street) -> Trajectory:
     """The poses that the vehicle believes: the true ones with a smooth error in x and y."""
     settings = city.settings
-    rng = stream(settings.seed, "odometry", settings.drive, _number(street))
+    rng = stream(settings.seed, "odometry", settings.drive, street.number)
     seconds = (truth.stamps_ns - truth.stamps_ns[0]) / 1e9
     T = truth.T_map_lidar.copy()
     T[:, :2, 3] += smooth(rng, seconds * settings.lidar.speed, settings.odometry_error)
@@ -188,7 +188,3 @@ def smooth(rng: np.random.Generator, arc: Float64, size: float, axes: int = 2) -
     phase = rng.uniform(0.0, 2 * np.pi, (4, axes))
     waves = np.sin(arc[:, None, None] * 2 * np.pi / length + phase).sum(axis=1)
     return np.asarray(waves * size / np.sqrt(2.0 * axes))
-
-
-def _number(street: Street) -> int:
-    return int.from_bytes(street.name.encode()[:4].ljust(4, b"\0"), "big")

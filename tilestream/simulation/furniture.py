@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from tilestream.records import Float64
 from tilestream.simulation.ground import Ground
@@ -50,7 +51,7 @@ class Furniture:
 
 def placed(streets: tuple[Street, ...], ground: Ground, settings: SimulationSettings) -> Furniture:
     """Where everything stands."""
-    routes = np.concatenate([street.xy for street in streets])
+    routes = KDTree(np.concatenate([street.xy for street in streets]))
     kinds = {}
     for kind in (*SPACING, "parking"):
         rng = stream(settings.seed, kind)
@@ -136,15 +137,12 @@ def _likely(
     return np.where(bare, 0.0, np.where(empty, 0.03 if kind == "lamp" else 0.0, base))
 
 
-def _free(xy: Float64, ground: Ground, routes: Float64, kind: str) -> NDArray[np.bool_]:
+def _free(xy: Float64, ground: Ground, routes: KDTree, kind: str) -> NDArray[np.bool_]:
     """Whether a place is clear of buildings and of every route."""
     room = 0.4 if kind in ("sign", "bollard") else LEAST_ROOM
     free = ground.space.at(xy) > room
-    for chunk in range(0, len(xy), 500):
-        part = slice(chunk, chunk + 500)
-        gap = np.abs(xy[part, None] - routes[None]).max(axis=2)
-        free[part] &= gap.min(axis=1) > ROUTE_ROOM * (1.0 if kind != "parking" else 0.9)
-    return free
+    gap, _ = routes.query(xy, p=np.inf)
+    return np.asarray(free & (gap > ROUTE_ROOM * (1.0 if kind != "parking" else 0.9)))
 
 
 def fixed(found: Furniture, ground: Ground, low: Float64, high: Float64) -> Mesh:

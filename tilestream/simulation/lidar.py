@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from tilestream.records import Float64, Scan
+from tilestream.records import Float64, Int64, Scan
 from tilestream.sensors import Sensor
 from tilestream.simulation.mesh import REFLECTIVITY, Material
 from tilestream.simulation.settings import LidarSettings, stream
@@ -38,6 +38,10 @@ class Turn:
     """(n,) beam, 0 the lowest."""
     time: Float64
     """(n,) firing time minus the middle of the turn [s]."""
+    number: Int64
+    """(n,) number of the ray in a turn without a blind sector."""
+    whole: int
+    """Rays of a turn without a blind sector."""
 
 
 def turn_of(sensor: Sensor, first_azimuth: float = np.pi, blind_deg: float = 0.0) -> Turn:
@@ -60,10 +64,13 @@ def turn_of(sensor: Sensor, first_azimuth: float = np.pi, blind_deg: float = 0.0
     time = ((np.arange(firings) + 0.5) / firings - 0.5) / sensor.rate_hz
     behind = np.abs(np.mod(azimuth, 2 * np.pi) - np.pi)
     seen = behind >= np.deg2rad(blind_deg) / 2 if blind_deg > 0 else np.ones(firings, bool)
+    number = np.arange(firings * beams).reshape(firings, beams)
     return Turn(
         direction[seen].reshape(-1, 3),
         np.tile(np.arange(beams, dtype=np.int32), int(seen.sum())),
         np.repeat(time[seen], beams),
+        number[seen].ravel(),
+        firings * beams,
     )
 
 
@@ -106,10 +113,13 @@ def measure(
     )
     direction = turned @ T_map_lidar[:3, :3].T
     true, cosine, material = nearest(targets, start, direction)
-    came = returned(rng, true, cosine, material, sensor.range_max, settings.glass_loss)
+    # Drawn for the whole turn, so that a ray's luck and noise do not depend on what others meet.
+    luck, noise = rng.uniform(size=turn.whole), rng.normal(0.0, sensor.range_noise, turn.whole)
+    came = returned(
+        luck[turn.number], true, cosine, material, sensor.range_max, settings.glass_loss
+    )
     bias = stream(seed[0], "beam bias").normal(0.0, settings.beam_bias, len(sensor.elevations_deg))
-    measured = true[came] + rng.normal(0.0, sensor.range_noise, int(came.sum()))
-    measured += bias[turn.ring[came]]
+    measured = true[came] + noise[turn.number[came]] + bias[turn.ring[came]]
     if settings.quantum > 0:
         measured = np.rint(measured / settings.quantum) * settings.quantum
     light = REFLECTIVITY[material[came]] * (0.3 + 0.7 * cosine[came])
@@ -139,18 +149,26 @@ def nearest(
 
 
 def returned(
-    rng: np.random.Generator,
+    luck: Float64,
     ranges: Float64,
     cosine: Float64,
     material: NDArray[np.uint8],
     range_max: float,
     glass_loss: float,
 ) -> NDArray[np.bool_]:
-    """Which rays come back: within range, and by chance where far, grazing, or on glass."""
+    """Which rays come back: within range, and by chance where far, grazing, or on glass.
+
+    Args:
+        luck: (n,) random number in [0, 1) of each ray.
+        ranges: (n,) of the first hits [m].
+        cosine: (n,) of incidence.
+        material: (n,) of what is hit.
+        range_max: largest range of a return [m].
+        glass_loss: share of the rays on glass that are lost.
+    """
     far = np.clip((ranges / range_max - FADING[0]) / (FADING[1] - FADING[0]), 0.0, 1.0)
     far = np.where(np.isfinite(ranges), far, 1.0)
     kept = (1.0 - 0.6 * far) * np.clip(cosine / GRAZING, 0.05, 1.0)
     kept = np.where(material == Material.GLASS, kept * (1.0 - glass_loss), kept)
-    lucky = rng.uniform(size=len(ranges)) < kept
-    came: NDArray[np.bool_] = lucky & (ranges >= LEAST_RANGE) & (ranges <= range_max)
+    came: NDArray[np.bool_] = (luck < kept) & (ranges >= LEAST_RANGE) & (ranges <= range_max)
     return came

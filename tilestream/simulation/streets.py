@@ -3,6 +3,7 @@
 import itertools
 import json
 import os
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -53,6 +54,11 @@ class Street:
     """Whether scans are taken along it; else it is only mapped."""
     spots: tuple[Spot, ...] = ()
     """Its tunnels, crossings, bridges and one-sided stretches."""
+
+    @property
+    def number(self) -> int:
+        """What its random streams are told apart by."""
+        return zlib.crc32(self.name.encode())
 
     @property
     def arc(self) -> Float64:
@@ -237,6 +243,19 @@ def read_streets(path: str | os.PathLike[str]) -> tuple[Street, ...]:
     except (KeyError, TypeError, ValueError) as error:
         raise CorruptSourceError(f"{path}: no GeoJSON of routes: {error!r}") from None
     return tuple(_street(properties, line, str(path)) for properties, line in lines)
+
+
+def street_called(streets: tuple[Street, ...], name: str) -> Street:
+    """The street of that name.
+
+    Raises:
+        UsageError: there is none; names those that are.
+    """
+    for street in streets:
+        if street.name == name:
+            return street
+    known = ", ".join(street.name for street in streets)
+    raise UsageError(f"no street is called {name}; there are {known}")
 
 
 def _street(properties: dict[str, Any], line: Float64, path: str) -> Street:

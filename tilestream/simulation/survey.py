@@ -38,23 +38,24 @@ def survey(city: City, street: Street, points: tuple[int, int], passes: int) -> 
     settings = city.settings
     begin, end = points
     still = Scene(city.scene(street.xy[begin:end], 0), np.array([*street.xy[begin], 0.0]))
-    number = int.from_bytes(street.name.encode()[:4].ljust(4, b"\0"), "big")
     traffic = traffic_of(street, settings, 1_000_000 + passes, settings.survey.traffic)
-    drift_of = stream(settings.seed, "drift", number, passes)
+    drift_of = stream(settings.seed, "drift", street.number, passes)
     drift = smooth(drift_of, street.arc, settings.survey.drift, axes=3)
     drift[:, 2] *= 0.5
     direction_of_travel = 1.0 if passes % 2 == 0 else -1.0
     found = []
     for point in range(begin, end):
-        rng = stream(settings.seed, "survey noise", number, passes, point)
+        rng = stream(settings.seed, "survey noise", street.number, passes, point)
         start, direction = _rays(city, street, point, direction_of_travel, rng)
         moving = Scene(
             traffic.mesh(city.ground, float(point), direction_of_travel * point / SPEED),
             still.origin,
         )
         ranges, cosine, material = nearest((still, moving), start, direction)
-        came = returned(rng, ranges, cosine, material, settings.survey.range_max, GLASS_LOSS)
-        measured = ranges[came] + rng.normal(0.0, settings.survey.noise, int(came.sum()))
+        luck = rng.uniform(size=len(ranges))
+        noise = rng.normal(0.0, settings.survey.noise, len(ranges))
+        came = returned(luck, ranges, cosine, material, settings.survey.range_max, GLASS_LOSS)
+        measured = ranges[came] + noise[came]
         found.append(start[came] + direction[came] * measured[:, None] + drift[point])
     return np.rint(np.concatenate(found) * 1000.0) / 1000.0
 
