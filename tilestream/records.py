@@ -197,7 +197,7 @@ def _whole(values: ArrayLike, name: str) -> Int64:
     return np.array(given, np.int64, order="C")
 
 
-Criterion = Literal["FS", "RQ", "LY", "LS", "place", "label"]
+Criterion = Literal["FS", "RQ", "LY", "LS", "OB", "place", "label"]
 """Feature sufficiency, representation quality, layout, local similarity (the paper, section V); or
 where a row is; or what was measured there."""
 
@@ -216,7 +216,7 @@ class Column:
     """What it says, in a sentence or two."""
     source: str
     """The formula, and where it comes from: `eq. 4`, `definitions, section 4`, …"""
-    factor_set: Literal["faithful", "robust"] = "faithful"
+    factor_set: Literal["faithful", "robust", "observability"] = "faithful"
     """The paper's own, or a twin that is not degenerate (definitions, sections 3 and 4)."""
     dtype: str = "float64"
     """Type of its values."""

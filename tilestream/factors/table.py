@@ -136,7 +136,7 @@ def factors(
         UsageError: positions of another shape or not finite, an unknown set, a cell size of which
             the tile size is no multiple.
     """
-    places = _places(positions)
+    places = places_of(positions)
     if which not in get_args(Which):
         raise UsageError(f"which is {which!r}: give one of {', '.join(get_args(Which))}")
     store.grid.require_cell_size(whole_mm(cell_size, "cell_size"))
@@ -162,8 +162,12 @@ def factors(
     return frame.assign(status=status.astype(str), reason=reason.astype(str))
 
 
-def _places(positions: ArrayLike) -> Float64:
-    """Positions as (k, 3) float64, with a height or without (NaN)."""
+def places_of(positions: ArrayLike) -> Float64:
+    """Positions as (k, 3) float64, with a height or without (NaN).
+
+    Raises:
+        UsageError: another shape, or values that are not finite (but for NaN as z).
+    """
     places = np.asarray(positions)
     if places.dtype.kind not in "iuf" or places.ndim != 2 or places.shape[1] != 3:
         raise UsageError(

@@ -1,0 +1,291 @@
+"""Observability and the virtual drive: closed forms, invariances, any tiling, bad places named."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scenes import PLACES
+
+import tilestream as ts
+from tilestream.errors import UsageError
+from tilestream.factors.observability import (
+    COLUMNS,
+    hessian_factors,
+    in_view,
+    information,
+    observability,
+)
+from tilestream.factors.surfels import Surfels, surfels_in
+from tilestream.factors.virtual_drive import (
+    physics,
+    physics_offset,
+    stratified_starts,
+    virtual_drive,
+    weighted_median,
+)
+from tilestream.factors.virtual_scan import Beams, Scene, VirtualSettings, cast
+from tilestream.formats.pcd import write_pcd
+from tilestream.localization import localization_error, register
+from tilestream.store import POINTS, Mark, Tile
+from tilestream.tiling import Box
+
+SENSOR = ts.VLP16.model_copy(update={"name": "short", "range_max": 15.0, "azimuth_step_deg": 3.0})
+SEEING = VirtualSettings(starts=8)
+PLACE = (20.0, 0.5, 2.0)
+
+
+def look(store: ts.TileStore, places: object, headings: object, **changes: object) -> pd.DataFrame:
+    how: dict[str, object] = {"sensor": SENSOR, "seeing": SEEING} | changes
+    return observability(store, places, headings, **how)  # type: ignore[arg-type]
+
+
+def cloud(folder: Path, place: str, size: float = 40.0) -> Path:
+    path = folder / f"{place}.pcd"
+    write_pcd(path, PLACES[place](np.random.default_rng(3), size, 0.25))
+    return path
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return cloud(tmp_path_factory.mktemp("street"), "canyon")
+
+
+@pytest.fixture(scope="module")
+def store(street: Path) -> ts.TileStore:
+    return ts.ingest(street, street.parent / "map.zarr", tile_size=20.0)
+
+
+@pytest.fixture(scope="module")
+def tunnel(tmp_path_factory: pytest.TempPathFactory) -> ts.TileStore:
+    folder = tmp_path_factory.mktemp("tunnel")
+    return ts.ingest(cloud(folder, "tunnel"), folder / "map.zarr")
+
+
+# --- The Hessian
+
+
+def test_information_of_independent_axes_is_their_own() -> None:
+    L = np.diag([4.0, 9.0, 25.0, 100.0, 200.0, 400.0])
+    found = information(L, 0.0)
+    assert found["ob_info_along"] == pytest.approx(4.0)
+    assert found["ob_info_yaw"] == pytest.approx(400.0)
+    assert found["ob_cov_across"] == pytest.approx(1.0 / 9.0)
+    assert found["ob_weak_info"] == pytest.approx(4.0)
+    assert found["ob_weak_angle"] == pytest.approx(0.0)
+    turned = information(L, math.pi / 2)
+    assert turned["ob_info_along"] == pytest.approx(9.0)
+    assert turned["ob_weak_angle"] == pytest.approx(math.pi / 2)
+
+
+def test_information_leaves_the_other_axes_free() -> None:
+    rng = np.random.default_rng(0)
+    half = rng.normal(size=(6, 9))
+    L = half @ half.T
+    for heading in (0.0, 0.7, -2.0):
+        found = information(L, heading)
+        for name in ("along", "across", "up", "yaw"):
+            assert found[f"ob_info_{name}"] * found[f"ob_cov_{name}"] == pytest.approx(1.0)
+        assert found["ob_weak_info"] <= min(found["ob_info_along"], found["ob_info_across"]) + 1e-9
+    values, axes = np.linalg.eigh(np.linalg.inv(np.linalg.inv(L)[:2, :2]))
+    along_weak = math.atan2(axes[1, 0], axes[0, 0])
+    found = information(L, along_weak)
+    assert found["ob_weak_info"] == pytest.approx(values[0])
+    assert found["ob_weak_angle"] == pytest.approx(0.0, abs=1e-9)
+    assert found["ob_info_along"] == pytest.approx(values[0])
+
+
+def test_a_saddle_has_no_variance_and_says_so() -> None:
+    found = information(np.diag([-1.0, 9.0, 25.0, 100.0, 200.0, 400.0]), 0.0)
+    assert found["ob_info_along"] == -1.0
+    assert math.isnan(found["ob_cov_along"])
+    assert math.isnan(found["ob_cov_yaw"])
+    singular = information(np.diag([1.0, 9.0, 0.0, 1.0, 1.0, 1.0]), 0.0)
+    assert math.isnan(singular["ob_info_along"])
+    assert math.isnan(singular["ob_weak_info"])
+
+
+def test_the_hessian_is_that_of_the_matcher_on_all_cells(store: ts.TileStore) -> None:
+    cells = store.cells_in(Box(-10_000, -30_000, 50_000, 30_000), 2.0)
+    points = np.random.default_rng(1).uniform((-8, -8, -2), (8, 8, 4), (400, 3))
+    T = np.eye(4)
+    T[:3, 3] = PLACE
+    for settings in (ts.RegistrationSettings(), ts.RegistrationSettings.autoware()):
+        found = hessian_factors(cells, points, T, settings)
+        still = settings.model_copy(update={"iterations_max": 0})
+        whole = register(cells, points, T, still)
+        expected = information(-whole.hessian[0], 0.0)
+        assert {name: found[name] for name in expected} == pytest.approx(expected, nan_ok=True)
+        assert found["ob_score"] == whole.score[0] / whole.points
+        assert found["ob_nvtl"] == whole.nvtl[0]
+        assert found["ob_points"] == whole.points
+        held = {tuple(v) for v in np.floor((points + PLACE) / 2.0).astype(int).tolist()}
+        assert found["ob_cells"] == len(held & {tuple(v) for v in cells.index.tolist()})
+
+
+def test_a_tunnel_holds_across_and_not_along(tunnel: ts.TileStore) -> None:
+    row = look(tunnel, [[20.0, 0.2, 2.0]], [0.0]).iloc[0]
+    assert row["status"] == "done", row["reason"]
+    assert row["ob_info_along"] < 0.2 * row["ob_info_across"]
+    assert row["ob_weak_angle"] < math.radians(10.0)
+    assert row["vd_along"] > 2.0 * row["vd_across"]
+    other_way = look(tunnel, [[20.0, 0.2, 2.0]], [math.pi / 2]).iloc[0]
+    assert other_way["ob_info_across"] < 0.2 * other_way["ob_info_along"]
+    assert other_way["ob_weak_angle"] > math.radians(80.0)
+
+
+# --- The virtual drive
+
+
+def test_the_starts_stand_for_the_whole_disc() -> None:
+    whole, even = stratified_starts(None)
+    assert len(whole) == 317
+    np.testing.assert_allclose(even, 1.0 / 317)
+    known = {tuple(start) for start in whole.tolist()}
+    for count in (16, 32, 64):
+        starts, weight = stratified_starts(count)
+        radius = np.hypot(*starts.T)
+        assert len(starts) == count
+        assert len({tuple(start) for start in starts.tolist()} & known) == count
+        assert weight.sum() == pytest.approx(1.0)
+        assert weight @ radius == pytest.approx(np.hypot(*whole.T).mean(), abs=0.05)
+        assert np.abs(weight @ starts).max() < 0.1
+    radius = np.hypot(*stratified_starts(32)[0].T)
+    rings = [(radius <= 1.0 + 1e-9).sum(), ((radius > 1.0 + 1e-9) & (radius <= 1.5)).sum()]
+    assert rings == [4, 8]
+
+
+def test_with_all_starts_it_is_the_label_of_the_virtual_scan(store: ts.TileStore) -> None:
+    cells = store.cells_in(Box(-10_000, -30_000, 50_000, 30_000), 2.0)
+    points = store.tile_at(20.0, 0.5).points()[::7] - PLACE
+    T = np.eye(4)
+    T[:3, 3] = PLACE
+    settings = ts.RegistrationSettings.autoware()
+    found = virtual_drive(cells, points, T, settings, stratified_starts(None))
+    label = localization_error(cells, points, T, settings=settings)
+    for name, expected in (
+        ("vd_mean", label.error_mean),
+        ("vd_floor", label.error_floor),
+        ("vd_tail", label.error_tail),
+        ("vd_p_fail", label.p_fail),
+        ("vd_along", label.along_mean),
+        ("vd_across", label.across_mean),
+        ("vd_up", label.up_mean),
+    ):
+        assert found[name] == pytest.approx(expected, abs=1e-12), name
+    held = np.sort(label.error[label.error <= 0.5])
+    assert held[(len(held) - 1) // 2] <= found["vd_median"] <= held[len(held) // 2]
+
+
+def test_a_weighted_median_has_half_of_the_weight_on_each_side() -> None:
+    values, weight = np.array([3.0, 1.0, 2.0]), np.array([0.1, 0.2, 0.7])
+    assert weighted_median(values, weight) == 2.0
+    assert weighted_median(values, np.array([0.1, 0.8, 0.1])) == 1.0
+    assert math.isnan(weighted_median(values[:0], weight[:0]))
+
+
+def test_physics_is_the_virtual_drive_and_one_number() -> None:
+    mean = np.array([0.1, 0.2, np.nan, 0.5])
+    np.testing.assert_array_equal(physics(mean), mean)
+    offset = physics_offset(mean, np.array([0.14, 0.23, 0.3, 0.9]))
+    assert offset == pytest.approx(0.04)
+    np.testing.assert_allclose(physics(mean, offset), mean + offset)
+
+
+# --- The table
+
+
+def test_every_column_is_there_and_documented(store: ts.TileStore) -> None:
+    table = look(store, [PLACE], [0.1])
+    assert table.columns.tolist() == [c.name for c in COLUMNS] + ["status", "reason"]
+    assert table["status"].tolist() == ["done"]
+    assert table[[c.name for c in COLUMNS]].notna().all(axis=None)
+    assert all(c.criterion == "OB" and c.factor_set == "observability" for c in COLUMNS)
+    assert all(c.unit and c.meaning and c.source for c in COLUMNS)
+
+
+def test_neither_tiling_nor_company_nor_order_shows(street: Path, tmp_path: Path) -> None:
+    places = np.array([[12.0, 0.5, 2.0], [20.0, 0.5, 2.0], [28.0, -1.0, 2.0]])
+    headings = np.array([0.1, 0.0, 3.0])
+    tables = []
+    for size in (100.0, 10.0):
+        other = ts.ingest(street, tmp_path / f"{size}.zarr", tile_size=size)
+        tables.append(look(other, places, headings))
+        back = look(other, places[::-1], headings[::-1])[::-1].reset_index(drop=True)
+        pd.testing.assert_frame_equal(back, tables[-1], check_exact=True)
+    alone = look(other, places[1:2], headings[1:2])
+    pd.testing.assert_frame_equal(tables[0], tables[1], check_exact=True)
+    assert alone.iloc[0].tolist() == tables[0].iloc[1].tolist()
+
+
+def test_a_wider_crop_of_the_map_shows_nothing_more(store: ts.TileStore) -> None:
+    everything = surfels_in(store, Box(-10_000, -30_000, 50_000, 30_000))
+    place = np.array([PLACE])
+    seen = in_view(everything, place, SENSOR.fov_deg, SENSOR.range_max)
+    assert 0 < len(seen) < 0.8 * len(everything)
+    place_mm, beams = np.rint(place[0] * 1000).astype(np.int64), Beams.of(SENSOR, SEEING)
+    found = []
+    for surfels in (everything, seen):
+        scene = Scene.of(surfels, place_mm[None], 200)
+        ranges, cosine = np.empty(len(beams.direction)), np.empty(len(beams.direction))
+        cast(scene.bricks, place_mm, beams.direction, 0.0, 15_000.0, ranges, cosine)
+        found.append(ranges)
+    np.testing.assert_array_equal(*found)
+    nothing = Surfels(np.zeros((0, 3), np.int64), np.zeros((0, 3), np.int16), np.zeros(0, np.int32))
+    assert len(in_view(nothing, place, SENSOR.fov_deg, 15.0)) == 0
+
+
+def test_the_rim_of_the_map_shows_in_the_unmapped_share(store: ts.TileStore) -> None:
+    table = look(store, [[20.0, 0.5, 2.0], [39.5, 0.5, 2.0]], [0.0, 0.0])
+    assert table["status"].tolist() == ["done", "done"]
+    assert table["ob_unmapped"][0] < 0.05
+    assert table["ob_unmapped"][1] > 0.3
+    assert table["ob_returns"][1] < table["ob_returns"][0]
+
+
+def test_bad_places_are_rows_that_say_so(store: ts.TileStore) -> None:
+    places = [
+        [20.0, 0.5, np.nan],
+        [900.0, 0.5, 2.0],
+        [20.0, 0.5, 60.0],
+        [20.0, 7.99, 3.0],
+        [20.0, 0.5, 2.0],
+    ]
+    table = look(store, places, np.zeros(5))
+    assert table["status"].tolist() == ["missing", "missing", "missing", "failed", "done"]
+    assert "no ground" in table["reason"][0]
+    assert "nothing in view: 0 of 1920 beams" in table["reason"][1]
+    assert "nothing in view" in table["reason"][2]
+    assert "inside a wall" in table["reason"][3]
+    assert table["vd_mean"][:4].isna().all()
+    thin = SENSOR.model_copy(update={"azimuth_step_deg": 90.0})
+    short = VirtualSettings(starts=8, range_max=8.0)
+    few = look(store, [PLACE], [0.0], sensor=thin, seeing=short)
+    assert few["status"].tolist() == ["failed"]
+    assert "points" in few["reason"][0]
+    assert few["ob_returns"][0] > 0
+
+
+def test_a_tile_that_failed_fails_those_who_see_it(street: Path, tmp_path: Path) -> None:
+    store = ts.ingest(street, tmp_path / "map.zarr", tile_size=10.0)
+    Tile(store, ts.TileKey(3, 0)).write_reason(POINTS, Mark("failed", "disk on fire"))
+    near = VirtualSettings(starts=8, range_max=8.0)
+    table = look(store, [[5.0, 0.5, 2.0], [28.0, 0.5, 2.0]], [0.0, 0.0], seeing=near)
+    assert table["status"].tolist() == ["done", "failed"]
+    assert "tile 3_0 is failed: disk on fire" in table["reason"][1]
+
+
+def test_what_cannot_be_is_refused(store: ts.TileStore) -> None:
+    for places, headings, match in (
+        ([PLACE], [0.0, 1.0], "headings have shape"),
+        ([PLACE], [np.nan], "headings have shape"),
+        ([[1.0, 2.0]], [0.0], "positions have shape"),
+        ([[np.inf, 2.0, 1.0]], [0.0], "position 0"),
+    ):
+        with pytest.raises(UsageError, match=match):
+            look(store, places, headings)
+    with pytest.raises(UsageError, match="cell_size"):
+        look(store, [PLACE], [0.0], cell_size=3.0)
+    with pytest.raises(UsageError, match="did you mean range_max"):
+        VirtualSettings(range_maxx=3.0)  # type: ignore[call-arg]

@@ -1,0 +1,354 @@
+"""Observability: how firmly a scan holds its place in the map, in every direction of the route.
+
+A fifth criterion that the paper lacks, from the map alone: the virtual scan of the sensor from the
+sample point (`virtual_scan.py`), the NDT Hessian of that scan at the sample point, and where
+registrations of it end (`virtual_drive.py`).
+"""
+
+import itertools
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike
+
+from tilestream.config import RegistrationSettings
+from tilestream.errors import RegistrationError, TileNotReadyError, UsageError
+from tilestream.factors import virtual_drive
+from tilestream.factors.surfels import Surfels, surfel_mm, surfels_in
+from tilestream.factors.table import NO_GROUND, places_of
+from tilestream.factors.virtual_drive import stratified_starts
+from tilestream.factors.virtual_scan import (
+    Beams,
+    Scene,
+    VirtualScan,
+    VirtualSettings,
+    crowded,
+    virtual_scan,
+)
+from tilestream.kernels.cells import cell_of_points, cell_sums
+from tilestream.localization import register
+from tilestream.records import Cells, Column, Float64, Int64
+from tilestream.sensors import VLP16, Sensor
+from tilestream.store import TileStore
+from tilestream.tiling import MM_PER_M, Box
+
+BLOCK = 25.0
+"""Sample points within a square of this edge share a scene [m]."""
+MARGIN = 10.0
+"""Map around what a scan sees: the way a start can go, and a cell [m]."""
+INSIDE = 0.4
+"""A place is inside a wall if more than this share of the beams meet the map at arm's length."""
+NOTHING = "nothing in view: {} of {} beams come back"
+WALLED = "inside a wall: {:.0%} of the beams meet the map within {:g} m"
+
+
+def _column(name: str, unit: str, meaning: str, source: str = "issue 8") -> Column:
+    return Column(name, "OB", unit, meaning, source, "observability")
+
+
+_SCHUR = "Schur complement of the axis in -H: L_ii - L_ir L_rr^-1 L_ri, L = -H in the route frame"
+_COVARIANCE = "diagonal of -H^-1 in the route frame"
+_WEAK = "2x2 Schur complement of along and across in -H"
+
+HESSIAN_COLUMNS = (
+    _column("ob_info_along", "1/m^2", "How sharply the score falls along the route.", _SCHUR),
+    _column("ob_info_across", "1/m^2", "The same across the route.", _SCHUR),
+    _column("ob_info_up", "1/m^2", "The same in map z.", _SCHUR),
+    _column("ob_info_yaw", "1/rad^2", "The same for the heading.", _SCHUR),
+    _column("ob_cov_along", "m^2", "Variance along; NaN: H has no maximum.", _COVARIANCE),
+    _column("ob_cov_across", "m^2", "Variance across; NaN likewise.", _COVARIANCE),
+    _column("ob_cov_up", "m^2", "Variance in map z; NaN likewise.", _COVARIANCE),
+    _column("ob_cov_yaw", "rad^2", "Variance of the heading; NaN likewise.", _COVARIANCE),
+    _column("ob_weak_info", "1/m^2", "How sharply the score falls where it is flattest.", _WEAK),
+    _column("ob_weak_angle", "rad", "Angle of that axis to the heading, 0 to pi/2.", _WEAK),
+)
+VIEW_COLUMNS = (
+    _column("ob_score", "1", "Expected score at the sample point, mean per scan point.", "eq. 12"),
+    _column("ob_nvtl", "1", "Expected NVTL at the sample point.", "Autoware"),
+    _column("ob_points", "1", "Points of the virtual scan after thinning."),
+    _column("ob_cells", "1", "Cells whose voxels these points hit."),
+    _column("ob_returns", "1", "Share of the beams that come back."),
+    _column("ob_unmapped", "1", "Share of the beams that meet nothing and leave the mapped area."),
+)
+COLUMNS = (*HESSIAN_COLUMNS, *VIEW_COLUMNS, *virtual_drive.COLUMNS)
+"""All columns of the criterion."""
+
+
+def observability(
+    store: TileStore,
+    positions: ArrayLike,
+    headings: ArrayLike,
+    sensor: Sensor = VLP16,
+    seeing: VirtualSettings | None = None,
+    registration: RegistrationSettings | None = None,
+    cell_size: float = 2.0,
+) -> pd.DataFrame:
+    """The observability factors and the virtual drive at sample points of a map.
+
+    Places are taken in whole millimetres, rounded. The result is the same to the bit for any tiling
+    of the map, any company and any order of the places.
+
+    Args:
+        store: the map.
+        positions: (k, 3) places of the lidar [m, map frame], already at its height. NaN as z: a
+            place without ground, see `sample_points`.
+        headings: (k,) directions of travel [rad, from the map's x axis].
+        sensor: beams, range and noise.
+        seeing: usable range, blind sector, drop-outs, starts; default `VirtualSettings()`.
+        registration: the matcher of the vehicle; default `RegistrationSettings()`.
+        cell_size: edge of a cell [m]; the tile size is a multiple of it.
+
+    Returns:
+        A row per position: `COLUMNS`, then `status` and `reason`. `missing`: no ground, or nothing
+        in view. `failed`: inside a wall, too little for the matcher, or a tile in range failed. All
+        columns are NaN there, but for `ob_returns` and `ob_unmapped` where a scan was taken.
+
+    Raises:
+        UsageError: positions or headings of another shape or not finite, a cell size of which the
+            tile size is no multiple.
+    """
+    places = places_of(positions)
+    turns = _headings(headings, len(places))
+    seeing, registration = seeing or VirtualSettings(), registration or RegistrationSettings()
+    view = _View(store, sensor, seeing, registration, cell_size)
+    rows: list[dict[str, object]] = [{"status": "missing", "reason": NO_GROUND} for _ in places]
+    for some in blocks_of(places):
+        try:
+            scene, cells = view.around(places[some])
+        except TileNotReadyError as error:
+            for row in some:
+                rows[row] = {"status": "failed", "reason": str(error)}
+            continue
+        for row in some:
+            rows[row] = view.seen_from(scene, cells, places[row], turns[row])
+    numbers = [[row.get(column.name, math.nan) for column in COLUMNS] for row in rows]
+    table = pd.DataFrame(
+        np.array(numbers, np.float64).reshape(len(rows), len(COLUMNS)),
+        columns=[column.name for column in COLUMNS],
+    )
+    return table.assign(
+        status=np.array([row["status"] for row in rows], dtype=str),
+        reason=np.array([row["reason"] for row in rows], dtype=object),
+    )
+
+
+class _View:
+    """What all places have in common."""
+
+    def __init__(
+        self,
+        store: TileStore,
+        sensor: Sensor,
+        seeing: VirtualSettings,
+        registration: RegistrationSettings,
+        cell_size: float,
+    ) -> None:
+        self.store = store
+        self.sensor = sensor
+        self.seeing = seeing
+        self.registration = registration
+        self.cell_size = cell_size
+        self.beams = Beams.of(sensor, seeing)
+        self.starts = stratified_starts(seeing.starts)
+
+    def around(self, places: Float64) -> tuple[Scene | None, Cells]:
+        """What can be seen from the places, None where nothing can, and the cells around."""
+        reach = self.beams.range_max
+        surfels = surfels_in(self.store, box_around(places, reach + 1.0))
+        surfels = in_view(surfels, places, self.sensor.fov_deg, reach)
+        cells = self.store.cells_in(box_around(places, reach + MARGIN), self.cell_size)
+        if not len(surfels):
+            return None, cells
+        return Scene.of(surfels, whole_places(places), surfel_mm(self.store)), cells
+
+    def seen_from(
+        self, scene: Scene | None, cells: Cells, place: Float64, heading: float
+    ) -> dict[str, object]:
+        """The row of a place, without what is missing there."""
+        n = len(self.beams.direction)
+        if scene is None:
+            return {"status": "missing", "reason": NOTHING.format(0, n)}
+        place_mm = whole_places(place)
+        walled = crowded(scene, place_mm, self.beams, self.seeing.range_min)
+        if walled > INSIDE:
+            reason = WALLED.format(walled, self.seeing.range_min)
+            return {"status": "failed", "reason": reason}
+        scan = virtual_scan(scene, place_mm, heading, self.sensor, self.seeing, self.beams)
+        view: dict[str, object] = {
+            "ob_returns": scan.return_share,
+            "ob_unmapped": scan.unmapped_share,
+        }
+        if not len(scan.points):
+            return {**view, "status": "missing", "reason": NOTHING.format(0, n)}
+        try:
+            return {
+                **view,
+                **self._held(cells, scan, place_mm, heading),
+                "status": "done",
+                "reason": "",
+            }
+        except RegistrationError as error:
+            return {**view, "status": "failed", "reason": str(error)}
+
+    def _held(
+        self, cells: Cells, scan: VirtualScan, place_mm: Int64, heading: float
+    ) -> dict[str, float]:
+        T_map_lidar = np.eye(4)
+        T_map_lidar[:2, :2] = _turn(heading)
+        T_map_lidar[:3, 3] = place_mm / MM_PER_M
+        return {
+            **hessian_factors(cells, scan.points, T_map_lidar, self.registration),
+            **virtual_drive.virtual_drive(
+                cells, scan.points, T_map_lidar, self.registration, self.starts
+            ),
+        }
+
+
+def hessian_factors(
+    cells: Cells, points: Float64, T_map_lidar: Float64, registration: RegistrationSettings
+) -> dict[str, float]:
+    """How firmly a scan holds its place: the NDT Hessian and score, without a step.
+
+    Args:
+        cells: the map around the place.
+        points: (n, 3) the scan in the lidar frame [m].
+        T_map_lidar: (4, 4) the place; the heading of the route is that of its x axis.
+        registration: the matcher.
+
+    Raises:
+        RegistrationError: as `register`.
+    """
+    in_map = points @ T_map_lidar[:3, :3].T + T_map_lidar[:3, 3]
+    voxels = _distinct(np.floor(in_map / cells.cell_size).astype(np.int64))
+    still = registration.model_copy(update={"iterations_max": 0})
+    near = _within_reach(cells, voxels)
+    found = register(near if len(near) else cells, points, T_map_lidar, still)
+    heading = math.atan2(T_map_lidar[1, 0], T_map_lidar[0, 0])
+    return {
+        **information(-found.hessian[0], heading),
+        "ob_score": float(found.score[0]) / found.points,
+        "ob_nvtl": float(found.nvtl[0]),
+        "ob_points": float(found.points),
+        "ob_cells": float((cell_of_points(voxels, 1, cells.index) >= 0).sum()),
+    }
+
+
+def _distinct(voxels: Int64) -> Int64:
+    """Voxels without repetition, lexicographic."""
+    index, _ = cell_sums(voxels, 1)
+    return index
+
+
+def _within_reach(cells: Cells, voxels: Int64) -> Cells:
+    """The cells that a point in one of the voxels can be scored against: no other one counts."""
+    around = np.array(list(itertools.product((-1, 0, 1), repeat=3)))
+    wanted = _distinct((voxels[:, None] + around).reshape(-1, 3))
+    rows = np.sort(cell_of_points(wanted, 1, cells.index))
+    rows = rows[rows >= 0]
+    return Cells(
+        cells.index[rows],
+        cells.count[rows],
+        cells.mean[rows],
+        cells.covariance[rows],
+        cells.cell_size,
+    )
+
+
+def information(L_map: Float64, heading: float) -> dict[str, float]:
+    """What -H says about each axis of the route, whatever the others do.
+
+    Args:
+        L_map: (6, 6) -H for steps (tau, w) in the map frame [m, rad].
+        heading: of the route [rad].
+
+    Returns:
+        `HESSIAN_COLUMNS`. A Schur complement may be negative where H is not definite; there the
+        variances are NaN. Where what is left out is singular it is NaN too.
+    """
+    R = np.eye(6)
+    R[:2, :2] = R[3:5, 3:5] = _turn(heading)
+    L = R.T @ L_map @ R
+    of = {"along": 0, "across": 1, "up": 2, "yaw": 5}
+    found = {f"ob_info_{name}": float(_schur(L, [axis])[0, 0]) for name, axis in of.items()}
+    definite = np.linalg.eigvalsh(L)[0] > 0.0
+    variance = np.diag(np.linalg.inv(L)) if definite else np.full(6, math.nan)
+    found |= {f"ob_cov_{name}": float(variance[axis]) for name, axis in of.items()}
+    plane = _schur(L, [0, 1])
+    if not np.isfinite(plane).all():
+        return found | {"ob_weak_info": math.nan, "ob_weak_angle": math.nan}
+    values, axes = np.linalg.eigh(plane)
+    angle = math.atan2(abs(axes[1, 0]), abs(axes[0, 0]))
+    return found | {"ob_weak_info": float(values[0]), "ob_weak_angle": angle}
+
+
+def _schur(L: Float64, kept: list[int]) -> Float64:
+    """The Schur complement of some axes, the others free; NaN where those are singular."""
+    free = [axis for axis in range(len(L)) if axis not in kept]
+    try:
+        solved = np.linalg.solve(L[np.ix_(free, free)], L[np.ix_(free, kept)])
+    except np.linalg.LinAlgError:
+        return np.full((len(kept), len(kept)), math.nan)
+    rest: Float64 = L[np.ix_(kept, kept)] - L[np.ix_(kept, free)] @ solved
+    return rest
+
+
+def in_view(
+    surfels: Surfels, places: Float64, fov_deg: tuple[float, float], reach: float
+) -> Surfels:
+    """The surfels that a beam from any of the places can meet, and a few more.
+
+    Args:
+        surfels: all around.
+        places: (k, 3) places [m, map frame], best near one another.
+        fov_deg: lowest and highest elevation of the beams [deg].
+        reach: how far they go [m].
+    """
+    middle = places.mean(axis=0)
+    around = float(np.hypot(*(places - middle)[:, :2].T).max())
+    offset = surfels.centre_mm / MM_PER_M - middle
+    away = np.hypot(offset[:, 0], offset[:, 1])
+    near, far = np.maximum(away - around - 1.0, 0.0), away + around + 1.0
+    low, high = (math.tan(math.radians(min(max(edge, -89.0), 89.0))) for edge in fov_deg)
+    bottom, top = (places - middle)[:, 2].min() - 1.0, (places - middle)[:, 2].max() + 1.0
+    floor = bottom + low * (far if low < 0.0 else near)
+    ceiling = top + high * (far if high > 0.0 else near)
+    return surfels.where((near <= reach) & (offset[:, 2] >= floor) & (offset[:, 2] <= ceiling))
+
+
+def blocks_of(places: Float64) -> Iterator[Int64]:
+    """Rows of places that share a scene, those with a height only."""
+    rows_of: dict[tuple[int, int], list[int]] = {}
+    for row, (x, y, z) in enumerate(places.tolist()):
+        if not math.isnan(z):
+            rows_of.setdefault((math.floor(x / BLOCK), math.floor(y / BLOCK)), []).append(row)
+    for rows in rows_of.values():
+        yield np.array(rows, np.int64)
+
+
+def box_around(places: Float64, reach: float) -> Box:
+    """The box that holds everything within `reach` [m] of (k, 3) places."""
+    low = np.floor((places[:, :2].min(axis=0) - reach) * MM_PER_M)
+    high = np.ceil((places[:, :2].max(axis=0) + reach) * MM_PER_M)
+    return Box(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+
+
+def whole_places(places: Float64) -> Int64:
+    """Places in whole millimetres, half to even."""
+    whole: Int64 = np.rint(places * MM_PER_M).astype(np.int64)
+    return whole
+
+
+def _turn(heading: float) -> Float64:
+    c, s = math.cos(heading), math.sin(heading)
+    return np.array([[c, -s], [s, c]])
+
+
+def _headings(headings: ArrayLike, k: int) -> Float64:
+    turns = np.asarray(headings)
+    if turns.dtype.kind not in "iuf" or turns.shape != (k,) or not np.isfinite(turns).all():
+        raise UsageError(
+            f"headings have shape {turns.shape} and type {turns.dtype}: give {k} finite radians"
+        )
+    return turns.astype(np.float64)

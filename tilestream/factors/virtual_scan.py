@@ -1,0 +1,228 @@
+"""The scan that a lidar would take at a place, from the map alone: its surfels, ray by ray."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from tilestream.config import Settings
+from tilestream.factors.surfels import Surfels
+from tilestream.kernels.surfels import NORMAL_ONE
+from tilestream.kernels.virtual_scan import (
+    BRICK,
+    FREE,
+    VOXELS,
+    Bricks,
+    bound_bricks,
+    cast,
+    fill_bricks,
+    leave_map,
+    mark_bricks,
+)
+from tilestream.records import Float64, Int64
+from tilestream.sensors import Sensor
+from tilestream.tiling import MM_PER_M
+
+COLUMN_MM = 10_000
+"""Edge of the columns that the map covers or not [mm]."""
+
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+
+
+class VirtualSettings(Settings):
+    """How a vehicle sees with its sensor, and how it is started in the virtual drive."""
+
+    range_max: Annotated[float, Field(gt=0.0)] | None = None
+    """Usable range [m], no more than the sensor's; None: the sensor's."""
+    range_min: Annotated[float, Field(ge=0.0)] = 0.9
+    """What is nearer is the vehicle itself, and is looked through [m]."""
+    blind_rear_deg: Annotated[float, Field(ge=0.0, lt=360.0)] = 0.0
+    """Sector to the rear that the vehicle hides [deg]."""
+    fading_from: Share = 0.6
+    """Share of the usable range beyond which returns get lost …"""
+    fading: Share = 0.6
+    """… up to this share of them at its end, linearly."""
+    grazing_deg: Annotated[float, Field(gt=0.0, lt=90.0)] = 75.0
+    """Angle of incidence beyond which returns get lost, as its cosine falls to 0 [deg]."""
+    starts: Annotated[int, Field(ge=8)] | None = 32
+    """Starts of the virtual drive, spread over the disc of starts; None: all of them."""
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    """Of noise and drop-outs, which the place decides together with it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """The surfels around some places, ready to be looked at."""
+
+    bricks: Bricks
+    """As beams find them."""
+    mapped: NDArray[np.bool_]
+    """(nx, ny) columns of 10 m that hold any of the map."""
+    mapped_corner: Int64
+    """(2,) their lowest corner [mm, map frame]."""
+
+    @classmethod
+    def of(cls, surfels: Surfels, places_mm: Int64, edge_mm: int) -> "Scene":
+        """The scene of surfels, and of the places from which it will be looked at.
+
+        Args:
+            surfels: all that can be seen from the places; at least one.
+            places_mm: (k, 3) the places [mm, map frame], k >= 1.
+            edge_mm: edge of the voxels of the surfels [mm].
+        """
+        size = BRICK * edge_mm
+        low = np.minimum(surfels.centre_mm.min(axis=0), places_mm.min(axis=0))
+        high = np.maximum(surfels.centre_mm.max(axis=0), places_mm.max(axis=0))
+        corner = (low // size - 1) * size
+        shape = (high - corner) // size + 2
+        table = np.zeros((len(surfels), 8), np.float32)
+        table[:, :3] = surfels.centre_mm - corner
+        table[:, 3:6] = surfels.normal / NORMAL_ONE
+        table[:, 6] = surfels.radius_mm
+        grid = np.full(tuple(shape), FREE, np.int32)
+        voxels = np.full((mark_bricks(table, edge_mm, grid), VOXELS), FREE, np.int32)
+        fill_bricks(table, edge_mm, grid, voxels)
+        column = surfels.centre_mm[:, :2] // COLUMN_MM
+        mapped_low = column.min(axis=0)
+        mapped = np.zeros(tuple(column.max(axis=0) - mapped_low + 1), np.bool_)
+        mapped[tuple((column - mapped_low).T)] = True
+        bounds = bound_bricks(edge_mm, grid, voxels)
+        bricks = Bricks(edge_mm, corner, grid, voxels, bounds, table)
+        return cls(bricks, mapped, mapped_low * COLUMN_MM)
+
+
+@dataclass(frozen=True, eq=False)
+class Beams:
+    """All beams of one turn of a sensor, as the vehicle lets them out."""
+
+    direction: Float64
+    """(n, 3) unit vectors in the lidar frame: x ahead, y left, z up; firing by firing, counter-
+    clockwise from ahead, each from the lowest beam to the highest."""
+    range_max: float
+    """How far they see [m]."""
+
+    @classmethod
+    def of(cls, sensor: Sensor, seeing: VirtualSettings) -> "Beams":
+        """The beams of a sensor, without its blind sector."""
+        firings = round(360.0 / sensor.azimuth_step_deg)
+        azimuth = np.arange(firings) * (2.0 * np.pi / firings)
+        if seeing.blind_rear_deg > 0.0:
+            blind = np.deg2rad(seeing.blind_rear_deg) / 2.0
+            azimuth = azimuth[np.abs(azimuth - np.pi) > blind - 1e-9]
+        elevation = np.deg2rad(np.array(sensor.elevations_deg))
+        across, up = np.cos(elevation), np.sin(elevation)
+        direction = np.empty((len(azimuth), len(elevation), 3))
+        direction[..., 0] = np.cos(azimuth)[:, None] * across
+        direction[..., 1] = np.sin(azimuth)[:, None] * across
+        direction[..., 2] = up
+        reach = sensor.range_max if seeing.range_max is None else seeing.range_max
+        return cls(direction.reshape(-1, 3), min(reach, sensor.range_max))
+
+
+def crowded(scene: Scene, place_mm: Int64, beams: Beams, within: float) -> float:
+    """Share of the beams of a lidar at a place that meet the map within some metres.
+
+    Args:
+        scene: the map around the place.
+        place_mm: (3,) of the lidar [mm, map frame].
+        beams: its beams, as if it headed along the map's x axis.
+        within: how near [m].
+    """
+    n = len(beams.direction)
+    ranges, cosine = np.empty(n), np.empty(n)
+    cast(scene.bricks, place_mm, beams.direction, 0.0, within * MM_PER_M, ranges, cosine)
+    return float(np.isfinite(ranges).mean())
+
+
+@dataclass(frozen=True, eq=False)
+class VirtualScan:
+    """What the beams of one turn meet at a place."""
+
+    ranges: Float64
+    """(n,) true range of each beam's first return [m]; inf: none."""
+    cosine: Float64
+    """(n,) of its incidence; 0: none."""
+    came: NDArray[np.bool_]
+    """(n,) which returns come back to the sensor."""
+    points: Float64
+    """(m, 3) those, with the noise of the sensor, in the lidar frame [m]."""
+    return_share: float
+    """Share of the beams that come back, 1 for all."""
+    unmapped_share: float
+    """Share of the beams that meet nothing and leave the mapped area."""
+
+
+def virtual_scan(
+    scene: Scene,
+    place_mm: Int64,
+    heading: float,
+    sensor: Sensor,
+    seeing: VirtualSettings,
+    beams: Beams,
+) -> VirtualScan:
+    """The scan of an upright lidar at a place: first returns, drop-outs, noise.
+
+    A return at range r with cosine of incidence c comes back with the probability
+    (1 - fading f) min(1, c / cos(grazing)), f rising linearly from 0 to 1 between `fading_from` and
+    1 of the usable range. Its range gets normal noise. Both are drawn from the place in whole
+    millimetres and the number of the beam alone.
+
+    Args:
+        scene: the map around the place, as far as the beams reach.
+        place_mm: (3,) of the lidar [mm, map frame].
+        heading: direction of travel [rad, from the map's x axis].
+        sensor: its noise.
+        seeing: its drop-outs.
+        beams: its beams, `Beams.of(sensor, seeing)`.
+    """
+    c, s = np.cos(heading), np.sin(heading)
+    R_map_lidar = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    direction = beams.direction @ R_map_lidar.T
+    n, reach = len(direction), beams.range_max * MM_PER_M
+    ranges, cosine = np.empty(n), np.empty(n)
+    near = seeing.range_min * MM_PER_M
+    cast(scene.bricks, place_mm, direction, near, reach, ranges, cosine)
+    left = leave_map(
+        scene.mapped, scene.mapped_corner, COLUMN_MM, place_mm, direction, ranges, reach
+    )
+    luck, radius, turn = draws(place_mm, seeing.seed, n, 3)
+    came = luck < probability(ranges, cosine, beams.range_max, seeing)
+    noise = np.sqrt(-2.0 * np.log(radius[came])) * np.cos(2.0 * np.pi * turn[came])
+    measured = ranges[came] + sensor.range_noise * noise
+    points = beams.direction[came] * measured[:, None]
+    return VirtualScan(ranges, cosine, came, points, float(came.mean()), float(left.mean()))
+
+
+def probability(
+    ranges: Float64, cosine: Float64, range_max: float, seeing: VirtualSettings
+) -> Float64:
+    """(n,) how likely returns are to come back (see `virtual_scan`); 0 where there is none."""
+    there = np.isfinite(ranges)
+    span = max((1.0 - seeing.fading_from) * range_max, 1e-9)
+    far = np.clip((np.where(there, ranges, 0.0) - seeing.fading_from * range_max) / span, 0.0, 1.0)
+    grazing = np.minimum(cosine / np.cos(np.deg2rad(seeing.grazing_deg)), 1.0)
+    return np.where(there, (1.0 - seeing.fading * far) * grazing, 0.0)
+
+
+def draws(place_mm: Int64, seed: int, beams: int, per_beam: int) -> Float64:
+    """(per_beam, beams) uniform numbers in (0, 1) that the place, the seed and the beam decide.
+
+    splitmix64 (Steele, Lea and Flood 2014), counted from a hash of the place.
+    """
+    state = np.array([seed], np.uint64)
+    for coordinate in place_mm.astype(np.int64).view(np.uint64):
+        state = _mixed(state + _GOLDEN) ^ coordinate
+    count = np.arange(1, per_beam * beams + 1, dtype=np.uint64).reshape(per_beam, beams)
+    bits = _mixed(_mixed(state + _GOLDEN) + count * _GOLDEN) >> np.uint64(11)
+    return (bits.astype(np.float64) + 0.5) * 2.0**-53
+
+
+_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+
+
+def _mixed(state: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return state ^ (state >> np.uint64(31))
