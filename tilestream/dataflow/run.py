@@ -7,7 +7,7 @@ import time
 import uuid
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -18,8 +18,9 @@ from dask.system import CPU_COUNT
 from distributed.comm.core import CommClosedError
 from distributed.utils import silence_logging_cmgr
 
+from tilestream.dataflow.dashboard import telling
 from tilestream.dataflow.plan import Task, megabytes
-from tilestream.dataflow.tasks import Outcome, attempt
+from tilestream.dataflow.tasks import NOT_RUN, Outcome, attempt
 from tilestream.errors import TaskError, UsageError
 
 logger = logging.getLogger(__name__)
@@ -84,12 +85,20 @@ def execute(
     for task in tasks:
         total[task.stage] += task.work
     frontier = Frontier(tasks, retries)
-    running = _run_here(frontier) if client is None else _run_on_dask(frontier, client, patience)
-    for outcome in running:
-        ended[outcome.key] = outcome
-        done[outcome.stage] += work[outcome.key]
-        if watch is not None:
-            watch(outcome, done[outcome.stage], total[outcome.stage])
+    names = DaskNames()
+    with ExitStack() as stack:
+        if client is None:
+            running, tell = _run_here(frontier), None
+        else:
+            running = _run_on_dask(frontier, client, names, patience)
+            tell = stack.enter_context(telling(client, tasks, names))
+        for outcome in running:
+            ended[outcome.key] = outcome
+            done[outcome.stage] += work[outcome.key]
+            if tell is not None:
+                tell(outcome)
+            if watch is not None:
+                watch(outcome, done[outcome.stage], total[outcome.stage])
     return [ended[task.key] for task in tasks]
 
 
@@ -161,8 +170,8 @@ class Frontier:
 
     def _refuse(self, task: Task, need: Outcome) -> Outcome:
         reason = need.reason
-        if not reason.startswith("not run, since "):
-            reason = f"not run, since {need.key} failed: {reason}"
+        if not need.refused:
+            reason = f"{NOT_RUN}{need.key} failed: {reason}"
         return Outcome(task.key, task.stage, None, reason)
 
 
@@ -171,11 +180,28 @@ def _run_here(frontier: Frontier) -> Iterator[Outcome]:
         yield from frontier.learn(attempt(task))
 
 
-def _run_on_dask(frontier: Frontier, client: Any, patience: float) -> Iterator[Outcome]:
+class DaskNames:
+    """The Dask keys of one run's tasks: `factors-ts0a1b2c-12_3` of `factors-12_3`.
+
+    Stage and tile stay readable, and two runs on one scheduler share no key.
+    """
+
+    def __init__(self) -> None:
+        self._run = f"{OURS}{uuid.uuid4().hex[:5]}"
+
+    def __call__(self, key: str) -> str:
+        """The Dask key of a task, from its own."""
+        stage, name = key.split("-", 1)
+        return f"{stage}-{self._run}-{name}"
+
+
+def _run_on_dask(
+    frontier: Frontier, client: Any, names: DaskNames, patience: float
+) -> Iterator[Outcome]:
     """As `_run_here`, with a bounded number of tasks at Dask at any time."""
     workers = _Workers(client, patience)
     workers.wait_for_orphans()
-    submit = _Submitter(client)
+    submit = _Submitter(client, names)
     running: dict[str, tuple[Task, Any]] = {}
     ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
     while True:
@@ -222,9 +248,9 @@ def _gathered(futures: Sequence[Any], client: Any) -> dict[str, Outcome]:
 class _Submitter:
     """Hands tasks to Dask under readable keys, each stage in a span of its own."""
 
-    def __init__(self, client: Any) -> None:
+    def __init__(self, client: Any, names: DaskNames) -> None:
         self._client = client
-        self._run = f"{OURS}{uuid.uuid4().hex[:5]}"  # two runs on one scheduler share no key
+        self._names = names
         self._spans: dict[str, Any] = {}
 
     def __call__(self, task: Task, tries: int) -> Any:
@@ -232,8 +258,7 @@ class _Submitter:
         if task.stage not in self._spans:
             with distributed.span("tilestream", task.stage):
                 self._spans[task.stage] = get_annotations()["span"]
-        stage, name = task.key.split("-", 1)
-        key = f"{stage}-{self._run}-{name}" + (f"#{tries + 1}" if tries else "")
+        key = self._names(task.key) + (f"#{tries + 1}" if tries else "")
         with annotate(span=self._spans[task.stage]):
             return self._client.submit(attempt, task, key=key, pure=False)
 

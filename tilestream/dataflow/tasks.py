@@ -11,6 +11,9 @@ from functools import singledispatch
 from tilestream.dataflow.plan import Task
 from tilestream.errors import TaskError, TilestreamError
 
+NOT_RUN = "not run, since "
+"""How the reason of a task begins that was refused because of another one."""
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -35,6 +38,11 @@ class Outcome:
     def ok(self) -> bool:
         """Whether the task is done."""
         return not self.reason
+
+    @property
+    def refused(self) -> bool:
+        """Whether it was not run, since a task that it needs had failed."""
+        return self.reason.startswith(NOT_RUN)
 
 
 @singledispatch
