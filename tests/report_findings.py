@@ -1,16 +1,21 @@
 """Findings made up for tests of the report: cheap, smooth, and with everything that can happen."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+import pytest
 
 from tilestream.forest.models import FORESTS, OPPONENTS
 from tilestream.records import Float64
-from tilestream.report.findings import Findings
+from tilestream.report import Findings, write_report
 
 ORIGIN = (368_000.0, 3_950_000.0, 40.0)
+LIMIT = 0.15
+"""Threshold of the reports [m]."""
 LENGTHS = {"I": 300, "II": 160}
 HOSTILE = "</script><script>fail()</script><img src=x onerror=fail()> $$x$$ 'ö\"&amp;"
 
@@ -207,5 +212,18 @@ def hostile() -> Findings:
         importances=found.importances.assign(factor=HOSTILE, criterion=HOSTILE),
         criterion_importances=found.criterion_importances.assign(criterion=HOSTILE),
         coverage=found.coverage.replace({"path": {"I": HOSTILE}}),
+        around=None,
         facts={HOSTILE: {HOSTILE: HOSTILE}, "notes": [HOSTILE], "attributions": [HOSTILE]},
     )
+
+
+def written(make: Callable[[], Findings], folders: pytest.TempPathFactory) -> Path:
+    """The folder of a report, written once for all tests."""
+    if make not in _WRITTEN:
+        folder = folders.mktemp("reports") / "new" / make.__name__
+        write_report(make(), folder, threshold=LIMIT)
+        _WRITTEN[make] = folder
+    return _WRITTEN[make]
+
+
+_WRITTEN: dict[Callable[[], Findings], Path] = {}

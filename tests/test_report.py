@@ -16,12 +16,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyproj import CRS, Transformer
 from report_findings import (
+    LIMIT,
     hostile,
     nothing_estimated,
     one_place,
     places_of,
     whole,
     without_labels,
+    written,
 )
 from report_json import sources
 
@@ -34,7 +36,6 @@ from tilestream.report.colours import MISSING, STEPS, palette, scale_of
 from tilestream.report.judgement import joined, reaches, segments, worst_places
 from tilestream.report.summary import plain, with_gaps
 
-LIMIT = 0.15
 FILES = (
     "index.html",
     "places.parquet",
@@ -51,10 +52,8 @@ def found() -> Findings:
 
 
 @pytest.fixture(scope="module")
-def folder(found: Findings, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    place = tmp_path_factory.mktemp("report")
-    write_report(found, place, threshold=LIMIT)
-    return place
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return written(whole, tmp_path_factory)
 
 
 def strict_json(path: Path) -> Any:
@@ -65,20 +64,16 @@ def strict_json(path: Path) -> Any:
 
 
 @pytest.mark.parametrize("make", [whole, without_labels, one_place, nothing_estimated, hostile])
-def test_all_files_are_there_and_whole(make: Any, tmp_path: Path) -> None:
-    given_findings = make()
-    content = write_report(given_findings, tmp_path / "new" / "report")
-    there = {p.name for p in (tmp_path / "new" / "report").iterdir()}
-    assert there == {*FILES, "figures"}
-    assert strict_json(tmp_path / "new" / "report" / "report.json") == content
-    drawn = sorted(p.name for p in (tmp_path / "new" / "report" / "figures").iterdir())
-    assert drawn == content["figures"]
+def test_all_files_are_there_and_whole(make: Any, tmp_path_factory: pytest.TempPathFactory) -> None:
+    folder = written(make, tmp_path_factory)
+    assert {p.name for p in folder.iterdir()} == {*FILES, "figures"}
+    drawn = sorted(p.name for p in (folder / "figures").iterdir())
+    assert drawn == strict_json(folder / "report.json")["figures"]
     for name in drawn:
-        picture = matplotlib.image.imread(tmp_path / "new" / "report" / "figures" / name)
+        picture = matplotlib.image.imread(folder / "figures" / name)
         assert picture.shape[0] > 100
         assert np.ptp(picture[..., :3]) > 0.1
-    table = pq.read_table(tmp_path / "new" / "report" / "places.parquet")
-    assert table.num_rows == len(given_findings.places)
+    assert pq.read_table(folder / "places.parquet").num_rows == len(make().places)
 
 
 def test_the_headline_is_what_the_places_say(found: Findings, folder: Path) -> None:
@@ -238,7 +233,7 @@ def literal_segments(places: pd.DataFrame, threshold: float) -> list[list[tuple[
     return runs
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(routes_with_gaps())
 def test_segments_are_the_runs_over_the_threshold(places: pd.DataFrame) -> None:
     places = Findings("t", places).places
@@ -252,7 +247,7 @@ def test_segments_are_the_runs_over_the_threshold(places: pd.DataFrame) -> None:
         assert joined(places)[run[:-1]].all()
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(routes_with_gaps())
 def test_reaches_add_up_to_the_road_between_neighbours(places: pd.DataFrame) -> None:
     places = Findings("t", places).places
@@ -295,7 +290,8 @@ def test_neither_order_nor_repetition_changes_a_byte(
         places=found.places.sample(frac=1.0, random_state=3),
         labels=found.labels.sample(frac=1.0, random_state=3),
     )
-    write_report(shuffled, tmp_path, threshold=LIMIT)
+    content = write_report(shuffled, tmp_path, threshold=LIMIT)
+    assert strict_json(tmp_path / "report.json") == content
     names = [p.relative_to(folder) for p in folder.rglob("*") if p.is_file()]
     assert len(names) == len(FILES) + 15
     for name in names:

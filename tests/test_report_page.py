@@ -13,12 +13,14 @@ import pytest
 from chromium import Page, chromium_page
 from report_findings import (
     HOSTILE,
+    LIMIT,
     hostile,
     nothing_estimated,
     one_place,
     places_of,
     whole,
     without_labels,
+    written,
 )
 from report_json import charts, source
 
@@ -30,7 +32,6 @@ from tilestream.report.page import CONTENTS
 from tilestream.report.sections import MODELS, PAPER_IMPORTANCES, PROTOCOL_NAMES
 from tilestream.report.words import length, span
 
-LIMIT = 0.15
 TAGS = re.compile(r"<(script|style)[^>]*>.*?</\1>|<[^>]*>", re.DOTALL)
 
 
@@ -40,21 +41,15 @@ def found() -> Findings:
 
 
 @pytest.fixture(scope="module")
-def page(found: Findings, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("report")
-    write_report(found, folder, threshold=LIMIT)
-    return folder / "index.html"
+def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return written(whole, tmp_path_factory) / "index.html"
 
 
 @pytest.fixture(scope="module")
 def others(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Pages of findings that lack or have too much of something."""
-    made = {}
-    for make in (without_labels, one_place, nothing_estimated, hostile):
-        folder = tmp_path_factory.mktemp(make.__name__)
-        write_report(replace(make(), around=None), folder)
-        made[make.__name__] = folder / "index.html"
-    return made
+    makes = (without_labels, one_place, nothing_estimated, hostile)
+    return {make.__name__: written(make, tmp_path_factory) / "index.html" for make in makes}
 
 
 def text_of(page: Path, section: str) -> str:
@@ -107,7 +102,9 @@ def test_the_headline_is_in_figures_that_a_person_reads(found: Findings, page: P
 def test_the_map_holds_every_place_once(found: Findings, page: Path) -> None:
     chart = charts(page)["city-map"]
     places = found.places.set_index(["route_id", "arc_length"])
-    labels = dict(re.findall(r'"axis_label": "([xy]) \[m\] from (\d+)"', json.dumps(chart)))
+    labels = dict(
+        re.findall(r'"axis_label": "([xy]) − (\d+) m"', json.dumps(chart, ensure_ascii=False))
+    )
     origin = np.array([float(labels["x"]), float(labels["y"])])
     seen = set()
     for kind in ("in_domain", "outside", "missing"):
@@ -172,7 +169,7 @@ def test_table_iv_stands_beside_the_papers_and_names_the_leak(page: Path) -> Non
     assert "not followed: one block only" in text
 
 
-def test_the_protocols_say_who_wins(page: Path) -> None:
+def test_the_protocols_say_who_wins(page: Path, tmp_path: Path) -> None:
     text = text_of(page, "protocols")
     assert "so these figures prove nothing. model" in text  # no verdict where it leaks
     verdict = "The best forest (2.00 cm) beats the best opponent (2.80 cm, the training median"
@@ -182,8 +179,8 @@ def test_the_protocols_say_who_wins(page: Path) -> None:
     losing = whole().protocols
     losing.loc[losing["model"] == "nearest training point", "mae"] = 0.001
     from_losers = replace(whole(), protocols=losing, around=None)
-    write_report(from_losers, page.parent / "losing")
-    text = text_of(page.parent / "losing" / "index.html", "protocols")
+    write_report(from_losers, tmp_path)
+    text = text_of(tmp_path / "index.html", "protocols")
     assert "does not beat the best opponent (0.10 cm, the nearest training point)" in text
 
 

@@ -83,7 +83,7 @@ def city_map(found: Findings) -> dict[str, Any]:
         bar.background_fill_alpha = 0.0
         plot.add_layout(bar, "right")
     plot.xaxis.axis_label, plot.yaxis.axis_label = (
-        f"{axis} [m]" + (f" from {value:.0f}" if value else "")
+        f"{axis} − {value:.0f} m" if value else f"{axis} [m]"
         for axis, value in zip("xy", origin, strict=True)
     )
     _finish(plot)
@@ -288,6 +288,8 @@ def _finish(plot: figure) -> None:
     plot.axis.axis_line_alpha = 0.4
     plot.axis.minor_tick_line_color = None
     plot.axis.formatter = NumeralTickFormatter(format="0[.]0")
+    # Short and small: BokehJS 3.9 draws a wide label of the x axis twice, once off to the left.
+    plot.axis.axis_label_text_font_size = "12px"
     plot.grid.grid_line_alpha = 0.35
     if plot.legend:
         plot.add_layout(plot.legend[0], "above")
