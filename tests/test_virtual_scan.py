@@ -426,7 +426,7 @@ def test_a_place_in_a_wall_is_crowded_and_one_beside_it_is_not() -> None:
 
 @pytest.mark.skipif("NUMBA_DISABLE_JIT" in os.environ, reason="is itself the run without the JIT")
 def test_the_kernels_say_the_same_without_the_compiler() -> None:
-    chosen = "literal_reference or decide_a_surfel or sparse_wall"
+    chosen = "literal_reference or decide_a_surfel"
     result = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-k", chosen, __file__],
         env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
@@ -435,4 +435,4 @@ def test_the_kernels_say_the_same_without_the_compiler() -> None:
         check=False,
     )
     assert result.returncode == 0, result.stdout
-    assert "3 passed" in result.stdout
+    assert "2 passed" in result.stdout

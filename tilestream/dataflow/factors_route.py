@@ -13,8 +13,8 @@ from tilestream.dataflow.plan import DEFAULT_MEMORY, Plan, Task
 from tilestream.dataflow.run import Watch, execute
 from tilestream.errors import PartialError, UsageError
 from tilestream.factors.catalogue import Which
+from tilestream.factors.rows import samples_by_tile
 from tilestream.factors.terms import reach_mm, terms_inputs
-from tilestream.formats.routes import resample
 from tilestream.records import Route
 from tilestream.sensors import VLP16, Sensor
 from tilestream.store import TileStore, hash_of
@@ -104,7 +104,7 @@ def plan_factors(
     terms: dict[TileKey, Task] = {}
     inputs: dict[TileKey, str] = {}
     tasks: list[Task] = []
-    for tile, rows in sorted(_by_tile(store, routes, spacing).items()):
+    for tile, rows in sorted(samples_by_tile(store, routes, spacing).items()):
         places = np.array([row[4:6] for row in rows])
         reach = looking.sensor.range_max
         seen = [k for k in store.grid.keys_over(box_around(places, reach)) if k in have]
@@ -130,17 +130,3 @@ def plan_factors(
             )
         )
     return Plan((*cells.values(), *terms.values(), *tasks), memory).check()
-
-
-def _by_tile(
-    store: TileStore, routes: Sequence[Route], spacing: float
-) -> dict[TileKey, list[tuple[int, int, float, float, float, float, float]]]:
-    """The sample points of all routes by the tile that holds them."""
-    found: dict[TileKey, list[tuple[int, int, float, float, float, float, float]]] = {}
-    for number, route in enumerate(routes):
-        points = resample(route, spacing)
-        columns = np.column_stack([points.arc_length, points.heading, points.positions])
-        for sample, row in enumerate(columns.tolist()):
-            key = store.grid.key_at(row[2], row[3])
-            found.setdefault(key, []).append((number, sample, *row))
-    return found

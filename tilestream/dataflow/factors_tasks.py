@@ -9,10 +9,10 @@ from tilestream.dataflow.plan import BASE_BYTES
 from tilestream.dataflow.tasks import perform
 from tilestream.errors import TileNotReadyError
 from tilestream.factors.catalogue import COLUMNS, Which
-from tilestream.factors.sample_points import raised
+from tilestream.factors.rows import PLACE_COLUMNS as PLACE_COLUMNS  # noqa: PLC0414 - for others
+from tilestream.factors.rows import STATUS_COLUMNS, Sample, sample_rows
 from tilestream.factors.table import TermsCache, factors
 from tilestream.factors.terms import terms_inputs, terms_table, tile_terms
-from tilestream.records import Column
 from tilestream.sensors import Sensor
 from tilestream.store import Mark, hash_of, open_store
 from tilestream.tables import read_mark, write_table
@@ -29,20 +29,6 @@ CACHE_BYTES = 300_000_000
 """Memory for the terms of the tiles in sight of a factors task."""
 FACTORS_BYTES = CACHE_BYTES + 300_000_000
 """Memory of a factors task beyond the interpreter: that, and the sums of some sample points."""
-
-PLACE_COLUMNS = (
-    Column("route_id", "place", "", "Name of the route.", "", dtype="str"),
-    Column("sample", "place", "1", "Number of the sample point on its route.", "", dtype="int64"),
-    Column("arc_length", "place", "m", "Length of the route up to here.", ""),
-    Column("heading", "place", "rad", "Direction of travel, from the map's x axis.", ""),
-    Column("x", "place", "m", "Place of the lidar.", "definitions, section 2"),
-    Column("y", "place", "m", "Place of the lidar.", "definitions, section 2"),
-    Column("z", "place", "m", "Place of the lidar: route or ground, plus its height.", "section 2"),
-)
-STATUS_COLUMNS = (
-    Column("status", "place", "", "done, missing or failed.", "", dtype="str"),
-    Column("reason", "place", "", "Why it is not done.", "", dtype="str"),
-)
 
 
 @dataclass(frozen=True)
@@ -85,8 +71,8 @@ class FactorsTask:
     tile: TileKey
     looking: Looking
     route_ids: tuple[str, ...]
-    samples: tuple[tuple[int, int, float, float, float, float, float], ...]
-    """(number of the route id, sample, arc length, heading, x, y, z of the route or NaN)."""
+    samples: tuple[Sample, ...]
+    """Its sample points."""
     map_state: str
     """Hash of the whole map: terms that a process holds are of this map only."""
     out: str
@@ -134,22 +120,16 @@ def _factors(task: FactorsTask) -> int:
     if mark is not None and mark["identity"] == task.identity:
         return 0
     store, looking = open_store(task.store_url), task.looking
-    columns = zip(*task.samples, strict=True)
-    frame = pd.DataFrame(dict(zip(_SAMPLE_FIELDS, columns, strict=True)))
-    frame["route_id"] = [task.route_ids[number] for number in frame.pop("route")]
-    positions = raised(frame[["x", "y", "z"]].to_numpy(), store, looking.sensor_height)
-    frame["z"] = positions[:, 2]
+    frame = sample_rows(task.samples, task.route_ids, store, looking.sensor_height)
+    positions = frame[["x", "y", "z"]].to_numpy()
     cache = _cache(task.store_url, looking.cell_size, task.map_state)
     found = factors(store, positions, looking.sensor, looking.cell_size, looking.which, cache)
-    frame = pd.concat([frame[[column.name for column in PLACE_COLUMNS]], found], axis=1)
+    frame = pd.concat([frame, found], axis=1)
     documented = (*PLACE_COLUMNS, *COLUMNS, *STATUS_COLUMNS)
     write_table(
         task.out, frame, documented, {"identity": task.identity, "data_set": facts(looking)}
     )
     return len(frame)
-
-
-_SAMPLE_FIELDS = ("route", "sample", "arc_length", "heading", "x", "y", "z")
 
 
 @lru_cache(maxsize=1)

@@ -44,6 +44,10 @@ NOTHING = "nothing in view: {} of {} beams come back"
 WALLED = "inside a wall: {:.0%} of the beams meet the map within {:g} m"
 
 
+Row = dict[str, object]
+"""A row of the table by column, without what is missing."""
+
+
 def _column(name: str, unit: str, meaning: str, source: str = "issue 8") -> Column:
     return Column(name, "OB", unit, meaning, source, "observability")
 
@@ -113,16 +117,10 @@ def observability(
     turns = _headings(headings, len(places))
     seeing, registration = seeing or VirtualSettings(), registration or RegistrationSettings()
     view = _View(store, sensor, seeing, registration, cell_size)
-    rows: list[dict[str, object]] = [{"status": "missing", "reason": NO_GROUND} for _ in places]
-    for some in blocks_of(places):
-        try:
-            scene, cells = view.around(places[some])
-        except TileNotReadyError as error:
-            for row in some:
-                rows[row] = {"status": "failed", "reason": str(error)}
-            continue
-        for row in some:
-            rows[row] = view.seen_from(scene, cells, places[row], turns[row])
+    rows: list[Row] = [{"status": "missing", "reason": NO_GROUND} for _ in places]
+    for some in tiles_of(places, store):
+        for row, found in view.rows(places, turns, some):
+            rows[row] = found
     numbers = [[row.get(column.name, math.nan) for column in COLUMNS] for row in rows]
     table = pd.DataFrame(
         np.array(numbers, np.float64).reshape(len(rows), len(COLUMNS)),
@@ -153,19 +151,38 @@ class _View:
         self.beams = Beams.of(sensor, seeing)
         self.starts = stratified_starts(seeing.starts)
 
-    def around(self, places: Float64) -> tuple[Scene | None, Cells]:
-        """What can be seen from the places, None where nothing can, and the cells around."""
+    def rows(self, places: Float64, turns: Float64, some: Int64) -> Iterator[tuple[int, Row]]:
+        """The rows of some places, which share what is read of the map.
+
+        Where a part of it cannot be read, each place looks alone: so none fails for another one.
+        """
+        try:
+            surfels, cells = self.around(places[some])
+        except TileNotReadyError as error:
+            if len(some) == 1:
+                yield int(some[0]), {"status": "failed", "reason": str(error)}
+                return
+            for row in some:
+                yield from self.rows(places, turns, np.array([row]))
+            return
+        for block in blocks_of(places, some):
+            scene = self.scene(surfels, places[block])
+            for row in block:
+                yield int(row), self.seen_from(scene, cells, places[row], turns[row])
+
+    def around(self, places: Float64) -> tuple[Surfels, Cells]:
+        """What of the map can be seen from the places, and the cells around that."""
         reach = self.beams.range_max
         surfels = surfels_in(self.store, box_around(places, reach + 1.0))
-        surfels = in_view(surfels, places, self.sensor.fov_deg, reach)
         cells = self.store.cells_in(box_around(places, reach + MARGIN), self.cell_size)
-        if not len(surfels):
-            return None, cells
-        return Scene.of(surfels, whole_places(places), surfel_mm(self.store)), cells
+        return in_view(surfels, places, self.sensor.fov_deg, reach), cells
 
-    def seen_from(
-        self, scene: Scene | None, cells: Cells, place: Float64, heading: float
-    ) -> dict[str, object]:
+    def scene(self, surfels: Surfels, places: Float64) -> Scene | None:
+        """What places near one another see; None: nothing."""
+        near = in_view(surfels, places, self.sensor.fov_deg, self.beams.range_max)
+        return Scene.of(near, whole_places(places), surfel_mm(self.store)) if len(near) else None
+
+    def seen_from(self, scene: Scene | None, cells: Cells, place: Float64, heading: float) -> Row:
         """The row of a place, without what is missing there."""
         n = len(self.beams.direction)
         if scene is None:
@@ -176,7 +193,7 @@ class _View:
             reason = WALLED.format(walled, self.seeing.range_min)
             return {"status": "failed", "reason": reason}
         scan = virtual_scan(scene, place_mm, heading, self.sensor, self.seeing, self.beams)
-        view: dict[str, object] = {
+        view: Row = {
             "ob_returns": scan.return_share,
             "ob_unmapped": scan.unmapped_share,
         }
@@ -317,14 +334,19 @@ def in_view(
     return surfels.where((near <= reach) & (offset[:, 2] >= floor) & (offset[:, 2] <= ceiling))
 
 
-def blocks_of(places: Float64) -> Iterator[Int64]:
-    """Rows of places that share a scene, those with a height only."""
-    rows_of: dict[tuple[int, int], list[int]] = {}
-    for row, (x, y, z) in enumerate(places.tolist()):
-        if not math.isnan(z):
-            rows_of.setdefault((math.floor(x / BLOCK), math.floor(y / BLOCK)), []).append(row)
-    for rows in rows_of.values():
-        yield np.array(rows, np.int64)
+def tiles_of(places: Float64, store: TileStore) -> Iterator[Int64]:
+    """Rows of the places in each tile, those with a height only."""
+    there = np.flatnonzero(~np.isnan(places[:, 2]))
+    keys = [store.grid.key_at(x, y) for x, y in places[there, :2].tolist()]
+    for key in sorted(set(keys)):
+        yield there[[near == key for near in keys]]
+
+
+def blocks_of(places: Float64, some: Int64) -> Iterator[Int64]:
+    """Those of some rows that share a scene."""
+    blocks = np.floor(places[some, :2] / BLOCK).astype(np.int64)
+    for block in np.unique(blocks, axis=0):
+        yield some[(blocks == block).all(axis=1)]
 
 
 def box_around(places: Float64, reach: float) -> Box:

@@ -53,6 +53,11 @@ def surfels_table(edge_mm: int) -> str:
     return f"surfels_{edge_mm}"
 
 
+def around_tile(store: TileStore, key: TileKey) -> Box:
+    """The box of all points that the surfels of a tile depend on."""
+    return store.grid.core(key).grown(REACH_EDGES * surfel_mm(store))
+
+
 def surfels_inputs(
     store: TileStore, key: TileKey, have: Mapping[TileKey, str] | None = None
 ) -> str:
@@ -63,7 +68,7 @@ def surfels_inputs(
         key: the tile.
         have: the identity of the points of each tile of the map; None: as the store has them.
     """
-    keys = list(store.grid.keys_over(_around(store, key)))
+    keys = list(store.grid.keys_over(around_tile(store, key)))
     if have is not None:
         return hash_of([(str(near), have.get(near, MISSING.identity)) for near in keys])
     return hash_of([(str(near), Tile(store, near).mark(POINTS).identity) for near in keys])
@@ -76,7 +81,7 @@ def tile_surfels(store: TileStore, key: TileKey) -> Surfels:
         TileNotReadyError: the tile, or a neighbour that exists, is not done; says why.
     """
     edge = surfel_mm(store)
-    points = points_in(store, _around(store, key), key)
+    points = points_in(store, around_tile(store, key), key)
     index, sums = cell_sums(points, edge)
     low, core = index * edge, store.grid.core(key)
     return Surfels(*surfels_of(thin(index, sums, edge), index, edge, _inside(low, core)))
@@ -149,10 +154,6 @@ def points_in(store: TileStore, box: Box, key: TileKey | None = None) -> Int64:
 
 
 _NONE = Surfels(np.zeros((0, 3), np.int64), np.zeros((0, 3), np.int16), np.zeros(0, np.int32))
-
-
-def _around(store: TileStore, key: TileKey) -> Box:
-    return store.grid.core(key).grown(REACH_EDGES * surfel_mm(store))
 
 
 def _inside(points_mm: Int64, box: Box) -> NDArray[np.bool_]:
