@@ -33,13 +33,15 @@ class Nap:
 
 @perform.register
 def _nap(task: Nap) -> str:
-    time.sleep(task.seconds)
+    if task.seconds:
+        time.sleep(task.seconds)
     if task.notes:
         note = Path(task.notes) / f"{task.key}-{time.time_ns()}"
         note.touch()
         if len(list(note.parent.glob(f"{task.key}-*"))) <= task.failures:
             fail(task.how)
-    time.sleep(task.after)
+    if task.after:
+        time.sleep(task.after)
     return str(task.tile)
 
 

@@ -15,11 +15,11 @@ from typing import Any
 import distributed
 import pytest
 from chromium import chromium_page
+from elsewhere import scheduler_elsewhere
 from hypothesis import given
 from hypothesis import strategies as st
 from naps import Nap
 from PIL import Image
-from test_run import scheduler_elsewhere
 
 from tilestream.dataflow.dashboard import (
     GREY,

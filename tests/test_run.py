@@ -2,13 +2,11 @@
 
 import itertools
 import os
-import socket
 import subprocess
 import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +15,7 @@ import dask
 import distributed
 import psutil
 import pytest
+from elsewhere import scheduler_elsewhere
 from hypothesis import given
 from hypothesis import strategies as st
 from naps import Nap
@@ -256,6 +255,7 @@ def test_workers_print_nothing(tmp_path: Path) -> None:
 QUIET = """
 import sys
 sys.path.insert(0, {tests!r})
+from elsewhere import scheduler_elsewhere
 from naps import Nap
 from tilestream.dataflow.run import dask_client, execute
 from tilestream.tiling import TileKey
@@ -267,37 +267,6 @@ if __name__ == "__main__":
         outcomes = execute(naps, client, None, retries=1)
     print(sum(outcome.ok for outcome in outcomes), "of", len(outcomes))
 """
-
-
-@contextmanager
-def scheduler_elsewhere(
-    workers: int, *flags: str
-) -> Iterator[tuple[str, list["subprocess.Popen[bytes]"]]]:
-    """Address and processes of a scheduler in another process, and of its workers."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    protocol = "tls" if flags else "tcp"
-    address = f"{protocol}://127.0.0.1:{port}"
-    common = ["--host", "127.0.0.1", *flags]
-    program = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
-    commands = [[*program, *common, "--port", str(port), "--dashboard-address", "127.0.0.1:0"]]
-    program = [sys.executable, "-m", "distributed.cli.dask_worker"]
-    one = ["--nthreads", "1", "--no-dashboard"]
-    commands += [[*program, address, *common, *one]] * workers
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
-    processes = [
-        subprocess.Popen(
-            command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
-        for command in commands
-    ]
-    try:
-        yield address, processes
-    finally:
-        for process in reversed(processes):
-            process.kill()
-            process.wait(20)
 
 
 def test_a_scheduler_in_another_process_and_its_loss() -> None:
@@ -348,6 +317,7 @@ def test_a_run_waits_for_what_a_killed_client_left_behind(tmp_path: Path) -> Non
 KILLED = """
 import sys
 sys.path.insert(0, {tests!r})
+from elsewhere import scheduler_elsewhere
 from naps import Nap
 from tilestream.dataflow.run import dask_client, execute
 from tilestream.tiling import TileKey

@@ -1,0 +1,42 @@
+"""A Dask scheduler and workers in processes of their own, reached over TCP on loopback."""
+
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from tilestream.dataflow.run import ONE_THREAD
+
+
+@contextmanager
+def scheduler_elsewhere(
+    workers: int, *flags: str
+) -> Iterator[tuple[str, list["subprocess.Popen[bytes]"]]]:
+    """Address and processes of a scheduler in another process, and of its workers."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    protocol = "tls" if flags else "tcp"
+    address = f"{protocol}://127.0.0.1:{port}"
+    common = ["--host", "127.0.0.1", *flags]
+    program = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
+    commands = [[*program, *common, "--port", str(port), "--dashboard-address", "127.0.0.1:0"]]
+    program = [sys.executable, "-m", "distributed.cli.dask_worker"]
+    one = ["--nthreads", "1", "--no-dashboard"]
+    commands += [[*program, address, *common, *one]] * workers
+    environment = {**os.environ, **ONE_THREAD, "PYTHONPATH": str(Path(__file__).parent)}
+    processes = [
+        subprocess.Popen(
+            command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        for command in commands
+    ]
+    try:
+        yield address, processes
+    finally:
+        for process in reversed(processes):
+            process.kill()
+            process.wait(20)

@@ -1,0 +1,164 @@
+"""A synthetic city: the same bits from any way of running, and a client that stays small."""
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import city_tiles
+import numpy as np
+import pandas as pd
+import pytest
+from city_tiles import digest, run_city, write_city, write_drive
+from elsewhere import scheduler_elsewhere
+
+import tilestream as ts
+from tilestream.dataflow.run import dask_client
+
+N, SIZE = 2, 20.0
+
+
+@pytest.fixture(scope="module")
+def city(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("city")
+    write_city(folder, N, SIZE, 0.4)
+    write_drive(folder / "drive.mcap", SIZE, 0.6)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def serial(city: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    out = tmp_path_factory.mktemp("serial")
+    run_city(city, str(out), N, SIZE)
+    return digest(out)
+
+
+def test_a_moved_block_holds_the_moved_points(city: Path) -> None:
+    first, other = (
+        city_tiles.points_of(city / "blocks" / f"{n}.laz") for n in ("000_000", "001_001")
+    )
+    np.testing.assert_allclose(other, first + np.array([SIZE, SIZE, 0.0]), atol=1e-9)
+    assert len(first) > 4000
+    with_bounds = ts.formats.describe(city / "blocks" / "001_001.laz")
+    np.testing.assert_allclose(
+        with_bounds.bounds, [other.min(axis=0), other.max(axis=0)], atol=1e-9
+    )
+
+
+def test_two_workers_over_tcp_write_the_bytes_of_a_serial_run(
+    city: Path, serial: dict[str, str], tmp_path: Path
+) -> None:
+    with scheduler_elsewhere(2) as (address, _), dask_client(address, None, 10**9) as client:
+        run_city(city, str(tmp_path), N, SIZE, client=client)
+    assert len(serial) > 100
+    assert digest(tmp_path) == serial
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [1, 2])
+def test_any_number_of_workers_writes_the_bytes_of_a_serial_run(
+    city: Path, serial: dict[str, str], tmp_path: Path, workers: int
+) -> None:
+    with scheduler_elsewhere(workers) as (address, _), dask_client(address, None, 1) as client:
+        run_city(city, str(tmp_path / "tcp"), N, SIZE, client=client)
+    with dask_client(None, workers, 10**9) as client:
+        run_city(city, str(tmp_path / "local"), N, SIZE, client=client)
+    assert digest(tmp_path / "tcp") == digest(tmp_path / "local") == serial
+
+
+@pytest.fixture
+def bucket(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """A bucket of a real S3 server process on loopback."""
+    s3fs = pytest.importorskip("s3fs", reason="needs the extra s3")
+    pytest.importorskip("moto.server", reason="needs moto's S3 server")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    for name, value in {
+        "AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}",
+        "AWS_ACCESS_KEY_ID": "test",
+        "AWS_SECRET_ACCESS_KEY": "test",
+        "AWS_DEFAULT_REGION": "us-east-1",
+        "NO_PROXY": "127.0.0.1",
+    }.items():
+        monkeypatch.setenv(name, value)
+    server = subprocess.Popen(
+        [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env=dict(os.environ),
+    )
+    try:
+        until = time.monotonic() + 30.0
+        while True:
+            with socket.socket() as probe:
+                if probe.connect_ex(("127.0.0.1", port)) == 0:
+                    break
+            assert time.monotonic() < until, "no S3 server within 30 s"
+            time.sleep(0.1)
+        s3fs.S3FileSystem.clear_instance_cache()
+        s3fs.S3FileSystem().mkdir("city")
+        yield "s3://city"
+    finally:
+        server.kill()
+        server.wait()
+        s3fs.S3FileSystem.clear_instance_cache()
+
+
+@pytest.mark.slow
+def test_a_job_over_the_s3_protocol_gives_the_same_store_and_tables(
+    city: Path, tmp_path: Path, bucket: str
+) -> None:
+    run_city(city, str(tmp_path), N, SIZE)
+    with dask_client(None, 2, 10**9) as client:
+        run_city(city, f"{bucket}/run", N, SIZE, client=client)
+    near, far = ts.open_store(f"{tmp_path}/map.zarr"), ts.open_store(f"{bucket}/run/map.zarr")
+    assert far.marks() == near.marks()
+    for key in near.keys():
+        np.testing.assert_array_equal(far.tile(key).points(), near.tile(key).points())
+    tables = sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*.parquet"))
+    assert {path.split("/")[0] for path in tables} == {"factors", "errors", "starts"}
+    for path in tables:
+        pd.testing.assert_frame_equal(
+            pd.read_parquet(f"{bucket}/run/{path}"), pd.read_parquet(tmp_path / path)
+        )
+
+
+MEMORY = """
+import sys, time
+sys.path.insert(0, {tests!r})
+from naps import Nap
+from tilestream.dataflow.run import execute
+from tilestream.tiling import TileKey
+
+def resident():
+    return int(open("/proc/self/status").read().split("VmHWM:")[1].split()[0]) * 1024
+
+COUNT = 100_000
+before = resident()
+stages = [("", "cells"), ("cells", "terms"), ("terms", "factors"), ("factors", "predict")]
+tiles = [TileKey(i % 250, i // 250) for i in range(COUNT // 4)]
+tasks = [
+    Nap(tile, stage, needs=(f"{{need}}-{{tile}}",) if need else ())
+    for need, stage in stages
+    for tile in tiles
+]
+planned = resident()
+began = time.perf_counter()
+outcomes = execute(tasks, None, None)
+assert len(outcomes) == COUNT and all(outcome.ok for outcome in outcomes)
+print((planned - before) / 1e6, (resident() - planned) / 1e6, time.perf_counter() - began)
+"""
+
+
+def test_a_hundred_thousand_tasks_are_little_memory_and_time(tmp_path: Path) -> None:
+    script = tmp_path / "memory.py"
+    script.write_text(MEMORY.format(tests=str(Path(__file__).parent)))
+    told = subprocess.run([sys.executable, script], check=True, capture_output=True, text=True)
+    planned, executed, seconds = (float(value) for value in told.stdout.split())
+    assert planned < 120.0, "MB of the tasks themselves"
+    assert executed < 120.0, "MB beyond them"
+    assert seconds < 60.0
