@@ -332,6 +332,10 @@ def test_bad_findings_are_refused(tmp_path: Path) -> None:
         Findings(
             "t", places, labels=pd.DataFrame({"path": ["a"], "arc_length": 0, "error_mean": 1})
         )
+    labels = whole().labels
+    assert len(Findings("t", places, pd.concat([labels, labels])).labels) == len(labels)
+    with pytest.raises(UsageError, match="group 'morning' has path 'I' at 0 m twice"):
+        Findings("t", places, pd.concat([labels, labels.iloc[:1].assign(held_out=0.3)]))
     with pytest.raises(UsageError, match="threshold 0"):
         write_report(Findings("t", places), tmp_path, threshold=0.0)
     with pytest.raises(CrsError, match="'nowhere' is no CRS"):

@@ -212,11 +212,11 @@ def _measured(part: pd.DataFrame) -> dict[str, Any]:
 
 def _estimated(labels: pd.DataFrame, factor: float | None) -> dict[str, Any]:
     """The estimate at each labelled place of a path, its interval, and what was measured there."""
-    along = held_out_along(labels)
+    along = held_out_along(labels, factor)
     arc = along["arc_length"].to_numpy(np.float64)
     breaks = with_gaps(arc)
-    held, mean = (along[name].to_numpy(np.float64) for name in ("held_out", "error_mean"))
-    low, high = held / (factor or np.nan), held * (factor or np.nan)
+    names = ("held_out", "low", "high", "error_mean")
+    held, low, high, mean = (along[name].to_numpy(np.float64) for name in names)
     several = len(set(labels["group"])) > 1
     said: dict[float, list[str]] = {}
     for where, group, error in zip(

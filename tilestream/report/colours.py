@@ -13,8 +13,8 @@ MISSING = "#9a9a9a"
 """Places without an estimate."""
 ACTUAL, AGAIN, HELD_OUT = "#0072b2", "#56b4e9", "#d55e00"
 """Measured error of one drive and of another, and the estimate (Okabe and Ito's palette)."""
-CRITERION = {"FS": "#0072b2", "RQ": "#e69f00", "LY": "#009e73", "LS": "#cc79a7"}
-"""The paper's four criteria."""
+CRITERION = {"FS": "#0072b2", "RQ": "#e69f00", "LY": "#009e73", "LS": "#cc79a7", "OB": "#56b4e9"}
+"""The paper's four criteria, and observability."""
 OTHER = "#7f7f7f"
 CLIP = 0.98
 """Quantile of the estimates at which the colours end: a few lost places must not hide the rest."""

@@ -39,7 +39,9 @@ class Findings:
     """A row per sample point: `PLACE_COLUMNS`, `PREDICTION_COLUMNS` and the factors."""
     labels: pd.DataFrame = field(default_factory=_none)
     """A row per drive and labelled place: `Dataset.rows`, and `held_out` [m]: the estimate by a
-    model that has not seen the place's path; NaN where there is none."""
+    model that has not seen the place's path; NaN where there is none. `low` and `high` [m] where
+    that model has an interval of its own; else it is the factor of `coverage`.
+    A row that repeats another in every column counts once."""
     protocols: pd.DataFrame = field(default_factory=_none)
     """`evaluation.compare`."""
     table_iv: pd.DataFrame = field(default_factory=_none)
@@ -71,6 +73,15 @@ class Findings:
             raise UsageError(f"places: route {row['route_id']!r} has sample {row['sample']} twice")
         if len(self.labels):
             _require(self.labels, LABEL_COLUMNS, "labels")
+            labels = self.labels.drop_duplicates()
+            object.__setattr__(self, "labels", labels)
+            again = labels.duplicated(["group", "path", "arc_length"])
+            if again.any():
+                row = labels[again].iloc[0]
+                raise UsageError(
+                    f"labels: group {row['group']!r} has path {row['path']!r} at "
+                    f"{row['arc_length']:g} m twice"
+                )
         for name in ("places", "labels"):
             object.__setattr__(self, name, _in_order(getattr(self, name)))
 

@@ -141,11 +141,11 @@ def paths_figure(found: Findings) -> Figure:
             axes.plot(
                 arc, measured, "--" if number else "-", color=AGAIN if number else ACTUAL, lw=1.1
             )
-        arc, held = _broken(held_out_along(here), "held_out")
+        along = held_out_along(here, factor)
+        arc, held = _broken(along, "held_out")
         axes.plot(arc, held, color=HELD_OUT, lw=1.4)
-        if factor is not None:
-            low, high = held / factor, held * factor
-            axes.fill_between(arc, low, high, color=HELD_OUT, alpha=0.18, lw=0)
+        (_, low), (_, high) = _broken(along, "low"), _broken(along, "high")
+        axes.fill_between(arc, low, high, color=HELD_OUT, alpha=0.18, lw=0)
         axes.set_title(f"path {name}", loc="left", fontsize=10, parse_math=False)
         axes.set(ylabel="error [cm]", ylim=(0.0, None))
         axes.grid(alpha=0.25)

@@ -126,12 +126,14 @@ def paths(found: Findings) -> list[dict[str, Any]]:
     for name, part in found.labels.groupby("path", sort=True):
         actual, held = (part[c].to_numpy(np.float64) for c in ("error_mean", "held_out"))
         judged = np.isfinite(actual) & np.isfinite(held)
+        factor = interval_factor(found.coverage, str(name))
         row = {
             "path": str(name),
             "points": len(part),
             "groups": sorted(set(part["group"].astype(str))),
             "judged": int(judged.sum()),
-            "factor": interval_factor(found.coverage, str(name)),
+            "factor": factor,
+            "interval": bool(held_out_along(part, factor)["low"].notna().any()),
             "actual_median": float(np.nanmedian(actual)),
             "estimate_median": float(np.median(held[judged])) if judged.any() else None,
             "mae": None,
@@ -153,13 +155,22 @@ def interval_factor(coverage: pd.DataFrame, path: str) -> float | None:
     return float(factor[0]) if factor.size and np.isfinite(factor[0]) else None
 
 
-def held_out_along(labels: pd.DataFrame) -> pd.DataFrame:
+def held_out_along(labels: pd.DataFrame, factor: float | None) -> pd.DataFrame:
     """The held-out estimate of each labelled place of a path: drives over a place share it.
 
+    Args:
+        labels: of one path.
+        factor: of its interval (`interval_factor`), where the labels have no `low` and `high`.
+
     Returns:
-        A row per `arc_length` [m], rising, with `held_out` [m] and `error_mean` (of all drives).
+        A row per `arc_length` [m], rising, with `held_out`, `low`, `high` (NaN where there is no
+        interval) and `error_mean` (of all drives) [m].
     """
-    return labels.groupby("arc_length", as_index=False)[["held_out", "error_mean"]].mean()
+    if not {"low", "high"} <= set(labels):
+        held, wide = labels["held_out"], np.nan if factor is None else factor
+        labels = labels.assign(low=held / wide, high=held * wide)
+    names = ["held_out", "low", "high", "error_mean"]
+    return labels.groupby("arc_length", as_index=False)[names].mean()
 
 
 def with_gaps(arc: Float64) -> Int64:
