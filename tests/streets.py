@@ -50,6 +50,7 @@ def job(folder: Path, out: Path, **changes: object) -> RunSettings:
         "out": str(out),
         "map": {"sources": [str(folder / "map_*.pcd")], "tile_size": 50.0},
         "drives": [{"log": str(folder / f"{kind}.mcap")} for kind in STREETS],
+        "observe": None,
         "label": {"matcher": "default", "starts": {"radius": 0.4, "step": 0.2}},
     }
     return RunSettings(**(values | changes))

@@ -294,6 +294,50 @@ def test_a_model_of_another_sensor_is_refused_by_name(
         ts.run(settings)
 
 
+# --- The virtual drive
+
+
+def test_observability_joins_the_factors(inputs: Path, copy: Path) -> None:
+    told = Told()
+    ts.run(job(inputs, copy, observe={"range_max": 14.0}), watch=told)
+    assert {"surfels", "observe"} <= {outcome.stage for outcome in told.outcomes}
+    assert told.worked() == {"join", "judge", "weigh", "train", "predict"}
+    dataset = ts.dataset(copy)
+    assert len(dataset) == len(STREETS) * SCANS
+    assert {"vd_mean", "ob_info_along", "feature_count"} <= set(dataset.names)
+    found = json.loads((copy / "tables" / "evaluation.json").read_text())
+    sets = {row["factors"] for row in found["table_iv"]}
+    assert {"observability", "all + robust", "all + robust + observability"} <= sets
+    assert "physics" in {row["model"] for row in found["protocols"]}
+
+
+def test_physics_needs_no_drive(inputs: Path, tmp_path: Path) -> None:
+    routes = [str(inputs / "canyon.mcap"), str(inputs / "tunnel.mcap")]
+    model = {"recipe": "physics", "offset": 0.01}
+    settings = job(
+        inputs,
+        tmp_path / "run",
+        drives=[],
+        routes=routes,
+        observe={"range_max": 14.0},
+        model=model,
+        label={"matcher": "default"},
+    )
+    told = Told()
+    ts.run(settings, watch=told)
+    assert not {o.stage for o in told.outcomes} & {"register", "join", "train", "judge"}
+    places = pd.read_parquet(tmp_path / "run" / "report" / "places.parquet")
+    assert (places["estimate"] == places["vd_mean"] + 0.01).all()
+    assert (places["p_fail"] == places["vd_p_fail"]).all()
+    middle = places.groupby("route_id")["along"].median()
+    assert middle["tunnel"] > 1.5 * middle["canyon"]  # nothing holds a scan along a tunnel
+
+
+def test_physics_without_a_virtual_drive_is_refused(inputs: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="needs observe"):
+        job(inputs, tmp_path / "run", model={"recipe": "physics"})
+
+
 # --- The settings
 
 

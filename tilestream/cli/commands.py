@@ -34,6 +34,7 @@ from tilestream.cli.tables import (
 )
 from tilestream.config import IngestSettings, RegistrationSettings, StartSettings
 from tilestream.dataflow import ingest_map, main_job
+from tilestream.dataflow.dashboard import page_url
 from tilestream.dataflow.factors_route import factors_along, plan_factors
 from tilestream.dataflow.factors_tasks import Looking
 from tilestream.dataflow.localize_drive import localize as localize_drive
@@ -430,7 +431,7 @@ def do_job(settings: RunSettings, scheduler: str | None, workers: int | None) ->
     """Run the main job with progress; the run directory."""
     with dask_client(scheduler, workers, settings.memory) as client, progress() as watch:
         if client is not None:
-            err.print(f"Dask dashboard: {client.dashboard_link}", highlight=False, soft_wrap=True)
+            err.print(f"Watch it at {page_url(client)}", highlight=False, soft_wrap=True)
         return main_job.run(settings, client, watch)
 
 

@@ -1,7 +1,7 @@
 """The stages after measuring: join (to a dataset), judge, weigh, train, predict (a tile)."""
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from tilestream.dataflow.factors_tasks import PLACE_COLUMNS
 from tilestream.dataflow.localize_tasks import ERROR_COLUMNS, is_done
 from tilestream.dataflow.plan import BASE_BYTES
 from tilestream.dataflow.tasks import perform
 from tilestream.errors import ModelError, SourceNotFoundError, TaskError
-from tilestream.factors.catalogue import COLUMNS
+from tilestream.factors import catalogue, observability
+from tilestream.factors.rows import PLACE_COLUMNS
+from tilestream.factors.virtual_drive import physics
 from tilestream.forest.dataset import Dataset, features_of, join
 from tilestream.forest.evaluation import criterion_importances, factor_sets, importances, judge
 from tilestream.forest.model_file import load_model, save_model
@@ -24,6 +25,7 @@ from tilestream.forest.training import PREDICTION_COLUMNS, Model, predict, train
 from tilestream.records import Column
 from tilestream.store import hash_of
 from tilestream.tables import read_mark, read_tables, write_table
+from tilestream.tiling import TileKey
 from tilestream.version import VERSION
 
 JOIN_VERSION = 1
@@ -33,6 +35,13 @@ TRAIN_VERSION = 1
 FOREST_BYTES = 600_000_000
 """Memory of a task that grows forests, beyond the interpreter, for some thousand places."""
 
+MAY_BE_NAN = ("ob_cov_along", "ob_cov_across", "ob_cov_up", "ob_cov_yaw", "vd_median")
+"""What observability has no number for at a place that is lost: the others tell how lost it is."""
+COLUMNS = (
+    *catalogue.COLUMNS,
+    *(column for column in observability.COLUMNS if column.name not in MAY_BE_NAN),
+)
+"""All factors that a model may learn from."""
 DATASET_COLUMNS = (
     Column("group", "place", "", "Which drive, as whose sensor.", "", dtype="str"),
     Column("path", "place", "", "The route that the place lies on.", "", dtype="str"),
@@ -71,6 +80,8 @@ class JoinTask:
 
     factors: tuple[str, ...]
     """The factor tables."""
+    observed: tuple[str, ...]
+    """The tables of observability; empty: the job has none."""
     labels: tuple[tuple[str, tuple[str, ...]], ...]
     """(group, its error tables)."""
     made_with: tuple[tuple[str, Any], ...]
@@ -159,15 +170,20 @@ class PredictTask:
     """Estimate the error of the sample points of one tile."""
 
     model: str
+    """The model file; empty: none, the virtual drive as it is."""
     model_state: str
     """Hash of what the model was made from: a process keeps the model of the tile before."""
     factors: str
     """The tile's factor table."""
-    tile: str
+    observed: str
+    """Its table of observability; empty: the job has none."""
+    tile: TileKey
     made_with: tuple[tuple[str, Any], ...]
     out: str
     identity: str
     points: int
+    offset: float = 0.0
+    """Without a model: what a real scan adds to the error of a virtual one [m]."""
     needs: tuple[str, ...] = ("train-model",)
     promised_bytes: int = BASE_BYTES + FOREST_BYTES
     stage: str = "predict"
@@ -191,7 +207,7 @@ def _join(task: JoinTask) -> int:
     labels = {group: read_tables(paths) for group, paths in task.labels}
     marks = {group: read_mark(paths[0]) or {} for group, paths in task.labels}
     joined = join(
-        read_tables(task.factors),
+        places_with_factors(task.factors, task.observed),
         labels,
         COLUMNS,
         made_with=dict(task.made_with),
@@ -199,6 +215,25 @@ def _join(task: JoinTask) -> int:
     )
     write_dataset(joined, task.out, task.identity)
     return len(joined)
+
+
+def places_with_factors(factors: Sequence[str], observed: Sequence[str]) -> pd.DataFrame:
+    """Every sample point of these tables with all its factors.
+
+    A place that has the factors and could not be observed has NaN there, and says why.
+    """
+    places = read_tables(factors)
+    if not observed:
+        return places
+    keys = ["route_id", "sample"]
+    names = [column.name for column in observability.COLUMNS]
+    seen = read_tables(observed)[[*keys, *names, "status", "reason"]]
+    seen = seen.rename(columns={"status": "seen", "reason": "why"})
+    joined = places.merge(seen, on=keys, how="left", validate="one_to_one")
+    blind = (joined["status"] == "done") & (joined["seen"] != "done")
+    joined.loc[blind, "status"] = joined.loc[blind, "seen"].fillna("failed")
+    joined.loc[blind, "reason"] = joined.loc[blind, "why"].fillna("its task failed")
+    return joined.drop(columns=["seen", "why"])
 
 
 def write_dataset(dataset: Dataset, path: str, identity: str) -> None:
@@ -340,13 +375,36 @@ def _predict(task: PredictTask) -> int:
     """Rows written; 0 where they were there."""
     if is_done(task.out, task.identity):
         return 0
-    factors = read_tables([task.factors])
-    model = _model(task.model, task.model_state)
-    found = predict(model, factors, dict(task.made_with))
+    factors = places_with_factors([task.factors], [task.observed] if task.observed else [])
+    if task.model:
+        model = _model(task.model, task.model_state)
+        found = predict(model, factors, dict(task.made_with))
+    else:
+        found = physical(factors, task.offset)
     places = factors[[column.name for column in PLACE_COLUMNS]]
     frame = pd.concat([places, found], axis=1)
     write_table(task.out, frame, (*PLACE_COLUMNS, *PREDICTION_COLUMNS), {"identity": task.identity})
     return len(frame)
+
+
+def physical(places: pd.DataFrame, offset: float) -> pd.DataFrame:
+    """What the virtual drive says of places, in the columns of a model's estimates."""
+    good = places["status"] == "done"
+    error = physics(places["vd_mean"].to_numpy(), offset)
+    values: dict[str, Any] = {
+        "estimate": error,
+        "p_fail": places["vd_p_fail"],
+        "floor": physics(places["vd_floor"].to_numpy(), offset),
+        "tail": places["vd_tail"],
+        "along": places["vd_along"],
+        "across": places["vd_across"],
+        "up": places["vd_up"],
+    }
+    blank = {c.name: np.nan for c in PREDICTION_COLUMNS if c.dtype == "float64"}
+    frame = pd.DataFrame({**blank, **values}, index=places.index)
+    frame.loc[~good, list(values)] = np.nan
+    words = {"in_domain": good, "status": places["status"], "reason": places["reason"]}
+    return frame.assign(**words)[[column.name for column in PREDICTION_COLUMNS]]
 
 
 def train_identity(dataset: str, recipe: str, seed: int) -> str:
@@ -354,6 +412,8 @@ def train_identity(dataset: str, recipe: str, seed: int) -> str:
     return hash_of(dataset, recipe, seed, TRAIN_VERSION, VERSION)
 
 
-def predictions_identity(model_state: str, factors: str, made_with: Mapping[str, Any]) -> str:
+def predictions_identity(
+    model_state: str, factors: Sequence[str], made_with: Mapping[str, Any]
+) -> str:
     """What the estimates of a tile depend on."""
-    return hash_of(model_state, factors, dict(made_with), TRAIN_VERSION, VERSION)
+    return hash_of(model_state, list(factors), dict(made_with), TRAIN_VERSION, VERSION)

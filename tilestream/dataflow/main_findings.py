@@ -7,12 +7,18 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from tilestream.dataflow.estimate_tasks import JudgeTask, PredictTask, WeighTask, read_judged
+from tilestream.dataflow.estimate_tasks import (
+    JudgeTask,
+    PredictTask,
+    WeighTask,
+    places_with_factors,
+    read_judged,
+)
 from tilestream.dataflow.localize_tasks import box_around
 from tilestream.dataflow.plan import Task
 from tilestream.errors import ModelError
 from tilestream.forest.dataset import Dataset
-from tilestream.forest.evaluation import ceiling, figures_by_protocol
+from tilestream.forest.evaluation import ceiling, factor_sets, figures_by_protocol
 from tilestream.forest.intervals import coverage
 from tilestream.forest.training import PREDICTION_COLUMNS
 from tilestream.records import Float64
@@ -30,6 +36,8 @@ class Done:
 
     factors: tuple[str, ...]
     """Tables of factors."""
+    observed: tuple[str, ...]
+    """Tables of observability; empty: the job has none."""
     estimate: tuple[Task, ...]
     """The tasks after measuring that are done."""
     dataset: str | None
@@ -43,7 +51,7 @@ class Done:
 
 def places_of(done: Done) -> pd.DataFrame:
     """Every sample point with its factors and its estimate, or why it has none."""
-    factors = read_tables(done.factors).drop(columns=["status", "reason"])
+    factors = places_with_factors(done.factors, done.observed).drop(columns=["status", "reason"])
     tables = [task.out for task in done.estimate if isinstance(task, PredictTask)]
     names = [column.name for column in PREDICTION_COLUMNS]
     if tables:
@@ -81,15 +89,18 @@ def labels_of(
 
 
 def evaluation_of(
-    found: Mapping[tuple[str, str, str], Mapping[str, pd.DataFrame | str]],
+    found: Mapping[tuple[str, str, str], Mapping[str, pd.DataFrame | str]], whole: str
 ) -> dict[str, pd.DataFrame]:
-    """Judgements as tables: `protocols`, `table_iv`, `coverage`, and `parts` for other targets."""
+    """Judgements as tables: `protocols`, `table_iv`, `coverage`, and `parts` for other targets.
+
+    `whole` is what the set of all factors is called.
+    """
     rows = {key: figures_by_protocol(judgement, key[1]) for key, judgement in found.items()}
     protocols = [
         table for (target, _, chosen), table in rows.items() if (target, chosen) == (MAIN, "")
     ]
     sets = [
-        table.assign(factors=chosen or "all + robust")
+        table.assign(factors=chosen or whole)
         for (target, model, chosen), table in rows.items()
         if target == MAIN and (chosen or model in ("paper", "default"))
     ]
@@ -130,13 +141,14 @@ def findings_of(
 ) -> tuple[Findings, dict[str, Any]]:
     """All that the report tells, and the figures of the evaluation for machines."""
     places, found = places_of(done), done.judgements()
-    tables = evaluation_of(found)
+    whole = "" if dataset is None else list(factor_sets(dataset.columns))[-1]
+    tables = evaluation_of(found, whole)
     held = found.get((MAIN, "default", ""), {}).get("path")
     points = held if isinstance(held, pd.DataFrame) else None
     weights = [task.out for task in done.estimate if isinstance(task, WeighTask)]
     weighed = read_tables(weights) if weights else pd.DataFrame({"factor": []})
     ceiling_of = ceilings(dataset, (MAIN, "error_tail", "p_fail", "error_floor"))
-    whole = Findings(
+    gathered = Findings(
         title=title,
         places=places,
         labels=pd.DataFrame()
@@ -153,7 +165,7 @@ def findings_of(
         around=lambda x, y, _: points_around(store, x, y, AROUND),
     )
     evaluation = {name: table.to_dict("records") for name, table in tables.items()}
-    return whole, evaluation | {"ceilings": ceiling_of}
+    return gathered, evaluation | {"ceilings": ceiling_of}
 
 
 def points_around(store: TileStore, x: float, y: float, reach: float) -> Float64:

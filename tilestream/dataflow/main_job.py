@@ -37,6 +37,7 @@ from tilestream.dataflow.ingest_map import SourcesRead
 from tilestream.dataflow.localize_tasks import LabelTask, RegisterTask
 from tilestream.dataflow.main_findings import Done, findings_of
 from tilestream.dataflow.main_plan import Inputs, inputs_of, plan_estimate, plan_measure, read_map
+from tilestream.dataflow.observe_tasks import ObserveTask
 from tilestream.dataflow.plan import Plan, Task
 from tilestream.dataflow.run import Watch, execute, report_kept
 from tilestream.dataflow.run_settings import RunSettings, read_settings
@@ -186,7 +187,7 @@ def _forget_others(settings: RunSettings, measure: Plan) -> None:
     """Remove the tables of other settings, so that two jobs are never mixed in one directory."""
     by_folder: dict[str, list[str]] = {}
     for task in measure.tasks:
-        if isinstance(task, FactorsTask | RegisterTask | LabelTask):
+        if isinstance(task, FactorsTask | ObserveTask | RegisterTask | LabelTask):
             by_folder.setdefault(task.out.rsplit("/", 1)[0], []).append(task.out)
     for paths in by_folder.values():
         remove_others(paths)
@@ -249,6 +250,7 @@ def _report(
     """Gather what is done and write the report; without a single factor table there is none."""
     good = {outcome.key for outcome in book.outcomes if outcome.ok}
     factors = [t.out for t in measure.tasks if isinstance(t, FactorsTask) and t.key in good]
+    observed = [t.out for t in measure.tasks if isinstance(t, ObserveTask) and t.key in good]
     if not factors:
         return
     finished = tuple(task for task in estimate.tasks if task.key in good)
@@ -260,7 +262,7 @@ def _report(
     facts = _facts(settings, inputs, book, known)
     found, evaluation = findings_of(
         settings.report.title or settings.folder.name,
-        Done(tuple(factors), finished, joined[0] if joined else None),
+        Done(tuple(factors), tuple(observed), finished, joined[0] if joined else None),
         read.store,
         known,
         facts,

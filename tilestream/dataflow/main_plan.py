@@ -9,6 +9,7 @@ import numpy as np
 
 from tilestream.config import IngestSettings
 from tilestream.dataflow.estimate_tasks import (
+    COLUMNS,
     JOIN_VERSION,
     TRAIN_VERSION,
     JoinTask,
@@ -26,16 +27,19 @@ from tilestream.dataflow.ingest_map import SourcesRead, plan_ingest, read_source
 from tilestream.dataflow.ingest_tasks import ScatterTask
 from tilestream.dataflow.localize_drive import plan_localize
 from tilestream.dataflow.localize_tasks import LabelTask, Reading
+from tilestream.dataflow.observe_route import plan_observe
+from tilestream.dataflow.observe_tasks import ObserveTask, Observing
 from tilestream.dataflow.plan import Plan, Task
 from tilestream.dataflow.run import Watch
 from tilestream.dataflow.run_settings import DriveSettings, RunSettings
 from tilestream.dataflow.simulate import simulate
 from tilestream.dataflow.tasks import Outcome
 from tilestream.errors import SourceNotFoundError, StoreNotFoundError, UsageError
-from tilestream.factors.catalogue import COLUMNS
+from tilestream.factors import catalogue
+from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.forest.dataset import features_of, made_with
 from tilestream.forest.evaluation import factor_sets
-from tilestream.forest.models import COMPETITORS, OPPONENTS
+from tilestream.forest.models import COMPETITORS, OPPONENTS, PHYSICS
 from tilestream.formats import describe
 from tilestream.formats.mcap import ScanSelection
 from tilestream.formats.routes import read_routes
@@ -191,6 +195,18 @@ def plan_measure(
     planned = [
         plan_factors(store, inputs.routes, tables, settings.spacing, looking, settings.memory, have)
     ]
+    if settings.observe is not None:
+        planned.append(
+            plan_observe(
+                store,
+                inputs.routes,
+                tables,
+                settings.spacing,
+                observing_of(settings, settings.observe),
+                settings.memory,
+                have,
+            )
+        )
     for drive in inputs.drives:
         scans = ScanSelection(
             every=drive.every, offset=drive.offset, from_s=drive.from_s, until_s=drive.until_s
@@ -214,6 +230,29 @@ def plan_measure(
         )
     tasks = {task.key: task for plan in planned for task in plan.tasks}
     return Plan((*merges, *tasks.values()), settings.memory).check()
+
+
+def observing_of(settings: RunSettings, seeing: VirtualSettings) -> Observing:
+    """What the virtual drive is made with: the vehicle's lidar and its matcher."""
+    return Observing(
+        settings.looking_sensor,
+        seeing,
+        settings.label.registration,
+        settings.cell_size,
+        settings.sensor_height,
+    )
+
+
+def making_of(settings: RunSettings) -> dict[str, Any]:
+    """What the factors are made with, as a model remembers it."""
+    making = made_with(COLUMNS, settings.looking_sensor, settings.cell_size)
+    if settings.observe is None:
+        return making
+    return making | {
+        "seeing": settings.observe.model_dump(mode="json"),
+        "matcher": settings.label.registration.model_dump(mode="json"),
+        "sensor_height": settings.sensor_height,
+    }
 
 
 def reading_of(drive: DriveSettings) -> Reading:
@@ -245,7 +284,8 @@ def plan_estimate(settings: RunSettings, measure: Plan, outcomes: Sequence[Outco
     done = {outcome.key for outcome in outcomes if outcome.ok}
     factors = [t for t in measure.tasks if isinstance(t, FactorsTask) and t.key in done]
     labels = [t for t in measure.tasks if isinstance(t, LabelTask) and t.key in done]
-    making = made_with(COLUMNS, settings.looking_sensor, settings.cell_size)
+    observed = {t.tile: t for t in measure.tasks if isinstance(t, ObserveTask) and t.key in done}
+    making = making_of(settings)
     tables, tasks = f"{settings.out}/tables", list[Task]()
     model, state = str(settings.folder / "model.skops"), ""
     if labels and factors:
@@ -254,6 +294,7 @@ def plan_estimate(settings: RunSettings, measure: Plan, outcomes: Sequence[Outco
             groups.setdefault(label.group, []).append(label.out)
         identity = hash_of(
             [t.identity for t in factors],
+            [t.identity for t in observed.values()],
             [t.identity for t in labels],
             making,
             JOIN_VERSION,
@@ -261,6 +302,7 @@ def plan_estimate(settings: RunSettings, measure: Plan, outcomes: Sequence[Outco
         )
         join = JoinTask(
             tuple(task.out for task in factors),
+            tuple(task.out for task in observed.values()),
             tuple((group, tuple(paths)) for group, paths in groups.items()),
             tuple(making.items()),
             f"{tables}/samples/dataset.parquet",
@@ -268,39 +310,52 @@ def plan_estimate(settings: RunSettings, measure: Plan, outcomes: Sequence[Outco
             sum(task.work for task in labels),
         )
         tasks.append(join)
-        if settings.model.use is None:
+        if settings.model.use is None and settings.model.recipe != "physics":
             state = train_identity(identity, settings.model.recipe, settings.model.seed)
             seed = settings.model.seed
             tasks.append(TrainTask(join.out, settings.model.recipe, seed, model, state))
-            tasks += judges(join, f"{tables}/judged", seed)
+            tasks += judges(join, f"{tables}/judged", seed, bool(observed))
     if settings.model.use is not None:
         if not Path(settings.model.use).is_file():
             raise SourceNotFoundError(f"{settings.model.use}: no such model file")
         model, state = settings.model.use, file_hash(settings.model.use)
+    if settings.model.recipe == "physics":
+        model, state = "", f"physics {settings.model.offset}"
     if state:
-        tasks += [
-            PredictTask(
-                model,
-                state,
-                task.out,
-                str(task.tile),
-                tuple(making.items()),
-                f"{tables}/predictions/{task.tile}.parquet",
-                predictions_identity(state, task.identity, making),
-                task.work,
+        for task in factors:
+            seen = observed.get(task.tile)
+            inputs = [task.identity, "" if seen is None else seen.identity]
+            tasks.append(
+                PredictTask(
+                    model,
+                    state,
+                    task.out,
+                    "" if seen is None else seen.out,
+                    task.tile,
+                    tuple(making.items()),
+                    f"{tables}/predictions/{task.tile}.parquet",
+                    predictions_identity(state, inputs, making),
+                    task.work,
+                    settings.model.offset,
+                )
             )
-            for task in factors
-        ]
     return Plan(tuple(tasks), settings.memory).check()
 
 
-def judges(join: JoinTask, folder: str, seed: int) -> list[Task]:
-    """Every model and opponent on all factors, and the paper's forest on each set of Table IV."""
-    wanted = [(MAIN, competitor, "") for competitor in COMPETITORS]
-    sets = [name for name in factor_sets(features_of(COLUMNS)) if name != "all + robust"]
+def judges(join: JoinTask, folder: str, seed: int, observed: bool) -> list[Task]:
+    """Every model and opponent on all factors, the forests on each set of Table IV; the parts of
+    the error by ours and the simple opponents.
+    """
+    columns = features_of(COLUMNS if observed else catalogue.COLUMNS)
+    *sets, _ = factor_sets(columns)  # the last has all factors, as the competitors have
+    known = [name for name in COMPETITORS if observed or name not in PHYSICS]
+    wanted = [(MAIN, competitor, "") for competitor in known]
     wanted += [(MAIN, "paper", name) for name in sets]
-    simple = [name for name in OPPONENTS if name != "footprint forest"]
-    wanted += [(target, name, "") for target in PARTS for name in ("default", *simple)]
+    wanted += [(MAIN, "default", name) for name in sets if "LS" in name or "ob" in name]
+    simple = ["default", *(name for name in known if name in (*PHYSICS, *OPPONENTS))]
+    wanted += [
+        (target, name, "") for target in PARTS for name in simple if name != "footprint forest"
+    ]
     tasks: list[Task] = [
         JudgeTask(
             join.out,

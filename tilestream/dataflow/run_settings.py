@@ -10,6 +10,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from tilestream.config import IngestSettings, RegistrationSettings, Settings, StartSettings
 from tilestream.errors import SourceNotFoundError, UsageError
+from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.records import TruePose
 from tilestream.sensors import SENSORS, Sensor
 
@@ -115,8 +116,11 @@ class LabelSettings(Settings):
 class ModelSettings(Settings):
     """How the errors of the measured places become those of all places."""
 
-    recipe: Literal["default", "paper"] = "default"
-    """Ours, tuned on held-out blocks, or the paper's forest."""
+    recipe: Literal["default", "paper", "physics"] = "default"
+    """Ours, tuned on held-out blocks; the paper's forest; or no forest and no training: the virtual
+    drive as it is."""
+    offset: Annotated[float, Field(ge=0.0)] = 0.0
+    """With `physics`: what a real scan adds to the error of a virtual one [m]."""
     use: str | None = None
     """A model file to use instead of training; null: train on the drives."""
     seed: int = 0
@@ -155,6 +159,9 @@ class RunSettings(Settings):
     """Height of the lidar above the road [m]."""
     cell_size: Positive = 2.0
     """Edge of an NDT cell [m]."""
+    observe: VirtualSettings | None = VirtualSettings()
+    """How the vehicle's lidar sees in the virtual drive: usable range, blind sector, starts; null:
+    no virtual drive, the paper's factors and their twins only."""
     label: LabelSettings = LabelSettings()
     """How errors are measured."""
     model: ModelSettings = ModelSettings()
@@ -175,8 +182,11 @@ class RunSettings(Settings):
         if isinstance(self.sensor, str) and self.sensor not in SENSORS:
             known = ", ".join(SENSORS)
             raise ValueError(f"has the sensor {self.sensor!r}: known are {known}; or its fields")
-        if not (self.simulate or self.drives or self.model.use):
+        physics = self.model.recipe == "physics"
+        if not (self.simulate or self.drives or self.model.use or physics):
             raise ValueError("has nothing to learn from: give drives, simulate, or model.use")
+        if physics and (self.observe is None or self.model.use):
+            raise ValueError("has model.recipe physics, which needs observe and no model.use")
         if not (self.simulate or self.drives or self.routes):
             raise ValueError("has no routes: give files of routes, or drives")
         return self

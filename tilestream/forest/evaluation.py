@@ -115,14 +115,21 @@ def figures_of(points: pd.DataFrame) -> Figures:
 
 
 def factor_sets(columns: Sequence[Column]) -> dict[str, tuple[Column, ...]]:
-    """The columns of Table IV: the criteria added one by one, then the robust twins where there."""
+    """The columns of Table IV: the criteria added one by one; then, where there, the robust twins,
+    observability alone, and all together. The last set has all columns.
+    """
     faithful = [c for c in columns if c.factor_set == "faithful"]
+    observed = tuple(c for c in columns if c.factor_set == "observability")
     sets = {
         "+".join(CRITERIA[: k + 1]): tuple(c for c in faithful if c.criterion in CRITERIA[: k + 1])
         for k in range(len(CRITERIA))
     }
-    if len(faithful) < len(columns):
-        sets["all + robust"] = tuple(columns)
+    if len(faithful) + len(observed) < len(columns):
+        sets["all + robust"] = tuple(c for c in columns if c not in observed)
+    if observed:
+        sets["observability"] = observed
+        sets["all + observability"] = (*faithful, *observed)
+        sets["all + robust + observability"] = tuple(columns)
     return {name: chosen for name, chosen in sets.items() if chosen}
 
 

@@ -1,6 +1,6 @@
 """A model for every place: train it on a dataset, apply it to a table of factors."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -216,18 +216,25 @@ def _same_making(model: Model, made_with: Mapping[str, Any]) -> None:
                         f"{factor} is in {given.get(factor)!r} in the table and was in "
                         f"{trained.get(factor)!r} where the model was trained"
                     )
+        elif trained != given and isinstance(trained, Mapping) and isinstance(given, Mapping):
+            differ = sorted(k for k in {*trained, *given} if trained.get(k) != given.get(k))
+            raise ModelError(
+                f"{name} does not match in {', '.join(differ)}: the model was trained with "
+                f"{_short(trained, differ)}, the table was made with {_short(given, differ)}: "
+                "train a model for it"
+            )
         elif trained != given:
             raise ModelError(
-                f"{name} does not match: the model was trained with {_short(trained)}, the table "
-                f"was made with {_short(given)}: train a model for it"
+                f"{name} does not match: the model was trained with {trained!r}, the table was "
+                f"made with {given!r}: train a model for it"
             )
 
 
-def _short(value: Any) -> str:
-    if isinstance(value, Mapping) and "name" in value:
-        rest = ", ".join(f"{k} {v}" for k, v in value.items() if isinstance(v, int | float))
-        return f"{value['name']} ({rest})"
-    return repr(value)
+def _short(values: Mapping[str, Any], names: Sequence[str]) -> str:
+    """Some of the values; of lists their length."""
+    said = {k: values.get(k) for k in ("name", *names) if k in values}
+    short = {k: f"{len(v)} values" if isinstance(v, list | tuple) else v for k, v in said.items()}
+    return ", ".join(f"{name} {value}" for name, value in short.items())
 
 
 def _reasons(
