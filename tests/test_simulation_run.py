@@ -28,7 +28,13 @@ from tilestream.formats.mcap import ScanSelection, open_log
 from tilestream.records import Scan
 from tilestream.simulation.city import City, build_city
 from tilestream.simulation.drive import motion_of, scans, traffic_of
-from tilestream.simulation.settings import SimulationSettings, load_preset
+from tilestream.simulation.settings import (
+    CitySettings,
+    SimulationSettings,
+    SurveySettings,
+    TrafficSettings,
+    load_preset,
+)
 from tilestream.simulation.survey import survey
 
 A, B = 70, 30
@@ -75,9 +81,9 @@ def settings(tmp_path_factory: pytest.TempPathFactory) -> SimulationSettings:
     return SimulationSettings(
         preset="tiny",
         note="for tests",
-        city={"footprints": houses, "routes": routes},
-        survey={"rays_per_m": 1500},
-        traffic={"cars_per_100m": 6.0, "people_per_100m": 12.0},
+        city=CitySettings(footprints=houses, routes=routes),
+        survey=SurveySettings(rays_per_m=1500),
+        traffic=TrafficSettings(cars_per_100m=6.0, people_per_100m=12.0),
     )
 
 
@@ -153,7 +159,9 @@ def test_another_drive_adds_its_log_and_leaves_the_rest(
 ) -> None:
     folder = tmp_path / "two"
     shutil.copytree(made, folder)
+    written = {path: path.stat().st_mtime_ns for path in folder.rglob("*.*") if path.is_file()}
     simulate(settings.model_copy(update={"drive": 1}), folder)
+    assert written == {path: path.stat().st_mtime_ns for path in written}
     after = files(folder)
     second = after.pop("logs/drive1/A.mcap")
     assert after == files(made)
@@ -276,6 +284,8 @@ def test_the_plan_is_made_without_building_or_writing_anything(
     }
     assert all(bytes_ > BASE_BYTES for _, bytes_ in stages.values())
     assert sum(task.work for task in plan.tasks if task.stage == "survey") == 2 * (A + B)
+    dense = changed(settings, "survey", rays_per_m=10**6)
+    assert plan_simulation(dense, "out").promised_bytes > plan.promised_bytes + 10**9
     assert not (tmp_path / "out").exists()
     small = plan_simulation(settings, tmp_path / "out", paths=["A"], size="small")
     assert [task.work for task in small.tasks] == [40] * 4
@@ -377,7 +387,9 @@ def test_unknown_sensors_and_their_fields_are_named(tmp_path: Path) -> None:
 def test_routes_are_read_by_their_names(made: Path, city: City) -> None:
     routes = ts.read_routes(made / "routes.geojson")
     assert [route.route_id for route in routes] == ["A", "Abcd2"]
-    road = motion_of(city.street("A"), city.settings, 0.0).pose(city.ground, np.arange(A))
+    road = motion_of(city.street("A"), city.settings, 0.0).pose(
+        city.ground, np.arange(A, dtype=float)
+    )
     np.testing.assert_allclose(routes[0].positions, road[:, :3, 3], atol=1e-3)
 
 

@@ -33,6 +33,8 @@ STRETCH = 50
 """Sample points of a stretch: a task's worth."""
 SMALL_POINTS, SMALL_RAYS = 40, 4_000
 """Of `size="small"`: sample points of each path, rays per metre of the survey."""
+MEMORY_PER_RAY = 100
+"""Of a ray of the survey, in all its copies, until its stretch is written [bytes]."""
 BYTES_PER_RAY, BYTES_PER_SCAN = 4, 400_000
 """On disk, generously: of a survey, and of a scan while it waits for its log [bytes]."""
 POSE_NS = 50_000_000
@@ -193,7 +195,19 @@ def plan_simulation(
         for passes in range(settings.survey.passes):
             for begin, stop in pieces:
                 path = folder / "survey" / f"{street.name}_{passes}_{begin:05d}.laz"
-                tasks.append(SurveyTask(text, street.name, begin, stop, str(path), passes=passes))
+                tasks.append(
+                    SurveyTask(
+                        text,
+                        street.name,
+                        begin,
+                        stop,
+                        str(path),
+                        promised_bytes=BASE_BYTES
+                        + SCENE_BYTES
+                        + (stop - begin) * settings.survey.rays_per_m * MEMORY_PER_RAY,
+                        passes=passes,
+                    )
+                )
         log = folder / "logs" / f"drive{settings.drive}" / f"{street.name}.mcap"
         if not street.driven or log.exists():
             continue
@@ -221,7 +235,8 @@ def plan_simulation(
                 scans_per_point=scans_per_point,
             )
         )
-    return Plan((*tasks, *logs), BASE_BYTES + SCENE_BYTES).check()
+    largest = max((task.promised_bytes for task in (*tasks, *logs)), default=0)
+    return Plan((*tasks, *logs), largest)
 
 
 def _bytes_needed(plan: Plan, settings: SimulationSettings) -> int:
@@ -308,10 +323,15 @@ def _begin(folder: Path, city: City, plan: Plan, identity: dict[str, Any]) -> No
     }
     features = [_feature(street, city) for street in city.streets]
     routes = {"type": "FeatureCollection", "features": features}
-    with writing_whole(folder / ROUTES) as file:
-        file.write(f"{json.dumps(routes)}\n".encode())
-    with writing_whole(folder / RECORD) as file:
-        file.write(yaml.safe_dump(facts, sort_keys=True, allow_unicode=True).encode())
+    _keep(folder / ROUTES, f"{json.dumps(routes)}\n")
+    _keep(folder / RECORD, yaml.safe_dump(facts, sort_keys=True, allow_unicode=True))
+
+
+def _keep(path: Path, text: str) -> None:
+    """Write a file whole, unless it says so already: its time tells readers of a change."""
+    if not path.exists() or path.read_bytes() != text.encode():
+        with writing_whole(path) as file:
+            file.write(text.encode())
 
 
 def _feature(street: Street, city: City) -> dict[str, Any]:
