@@ -52,7 +52,7 @@ def city_map(found: Findings) -> dict[str, Any]:
     places = found.places
     estimate = estimates(places)
     scale, colours = scale_of(estimate), palette()
-    plot = _plot(600, "x", "y", MAP_TOOLS, match_aspect=True)
+    plot = new_plot(600, "x", "y", MAP_TOOLS, match_aspect=True)
     drawn = _drawn(places)
     origin = _origin(places)
     kinds = _kinds(places)
@@ -76,7 +76,7 @@ def city_map(found: Findings) -> dict[str, Any]:
         )
         glyphs = plot.scatter("x", "y", source=source, marker=marker, legend_label=name, **style)
         # of the dots under the mouse the worst, which is the one on top
-        plot.add_tools(_hover(glyphs, MAP_TIP, sort_by=[("estimate", -1)]))
+        plot.add_tools(hover(glyphs, MAP_TIP, sort_by=[("estimate", -1)]))
     _number_the_worst(plot, places, origin)
     if np.isfinite(estimate).any():
         bar = ColorBar(color_mapper=mapper, title="estimated error [cm]", width=12, padding=4)
@@ -86,8 +86,8 @@ def city_map(found: Findings) -> dict[str, Any]:
         f"{axis} − {value:.0f} m" if value else f"{axis} [m]"
         for axis, value in zip("xy", origin, strict=True)
     )
-    _finish(plot)
-    return _item(plot, "city-map")
+    finish(plot)
+    return item_of(plot, "city-map")
 
 
 def shown_every(places: pd.DataFrame) -> int:
@@ -174,7 +174,7 @@ def path_chart(found: Findings, path: str) -> dict[str, Any]:
     """
     labels = found.labels[found.labels["path"].astype(str) == path]
     factor = interval_factor(found.coverage, path)
-    plot = _plot(280, "along [m]", "error [cm]", PATH_TOOLS, y_range=DataRange1d(start=0))
+    plot = new_plot(280, "along [m]", "error [cm]", PATH_TOOLS, y_range=DataRange1d(start=0))
     columns = _estimated(labels, factor)
     _band(plot, columns)
     drives = list(labels.groupby("group", sort=True))
@@ -194,9 +194,9 @@ def path_chart(found: Findings, path: str) -> dict[str, Any]:
         style: dict[str, Any] = {"color": HELD_OUT, "line_width": 1.8, "legend_label": label}
         plot.line("arc", "estimate", source=source, **style)
     anchor = plot.line("arc", "anchor", source=source, line_alpha=0.0)
-    plot.add_tools(_hover(anchor, PATH_TIP, mode="vline"))
-    _finish(plot)
-    return _item(plot, f"path-{path}")
+    plot.add_tools(hover(anchor, PATH_TIP, mode="vline"))
+    finish(plot)
+    return item_of(plot, f"path-{path}")
 
 
 def _measured(part: pd.DataFrame) -> dict[str, Any]:
@@ -255,7 +255,7 @@ def _band(plot: figure, columns: dict[str, Any]) -> None:
         )
 
 
-def _hover(glyphs: "GlyphRenderer[Any]", tip: Any, **options: Any) -> HoverTool:
+def hover(glyphs: "GlyphRenderer[Any]", tip: Any, **options: Any) -> HoverTool:
     """Shows what is under the mouse; no button of its own in the toolbar."""
     return HoverTool(
         renderers=[glyphs],
@@ -267,7 +267,8 @@ def _hover(glyphs: "GlyphRenderer[Any]", tip: Any, **options: Any) -> HoverTool:
     )
 
 
-def _plot(height: int, x: str, y: str, tools: str, **options: Any) -> figure:
+def new_plot(height: int, x: str, y: str, tools: str, **options: Any) -> figure:
+    """An empty chart as wide as the page, its axes named."""
     plot = figure(
         height=height,
         sizing_mode="stretch_width",
@@ -281,7 +282,7 @@ def _plot(height: int, x: str, y: str, tools: str, **options: Any) -> figure:
     return plot
 
 
-def _finish(plot: figure) -> None:
+def finish(plot: figure) -> None:
     """Calm, and see-through, so that the page's own colours stand behind."""
     plot.background_fill_alpha = plot.border_fill_alpha = 0.0
     plot.outline_line_color = None
@@ -302,7 +303,8 @@ def _finish(plot: figure) -> None:
         plot.legend.click_policy = "hide"
 
 
-def _item(plot: figure, target: str) -> dict[str, Any]:
+def item_of(plot: figure, target: str) -> dict[str, Any]:
+    """A chart as `Bokeh.embed.embed_item` takes it, to be drawn in the element `target`."""
     item: dict[str, Any] = json_item(plot, ID(target))  # type: ignore[assignment]
     found: dict[str, str] = {}
     _collect(item, found)
