@@ -2,14 +2,17 @@
 
     python benchmarks/shinjuku_labels.py [--preset paper] [--out FOLDER] [--every 10] [--workers 1]
     python benchmarks/shinjuku_labels.py --drives 0 1     # the ceiling: two drives of every path
-    python benchmarks/shinjuku_labels.py --knobs          # one phenomenon switched off at a time
+    python benchmarks/shinjuku_labels.py --knobs drive    # one phenomenon switched off at a time
+    python benchmarks/shinjuku_labels.py --knobs map --paths III
 
 Simulates what is not there yet, makes the map of every street, registers every n-th scan from 317
 starts with the production matcher, and prints the shares of sample points beyond each limit. With
-`--every 1` all 3612 sample points are labelled. `--knobs` simulates `--paths` anew for each knob.
+`--every 1` all 3612 sample points are labelled. `--knobs drive` measures anew
+at the sample points, in the map that is there; `--knobs map` simulates anew for each knob.
 """
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +20,14 @@ import numpy as np
 import pandas as pd
 
 import tilestream as ts
+from tilestream.dataflow.localize_tasks import box_around
 from tilestream.dataflow.plan import DEFAULT_MEMORY
 from tilestream.dataflow.run import dask_client
 from tilestream.dataflow.simulate import simulate
 from tilestream.formats.mcap import ScanSelection
+from tilestream.records import Float64
+from tilestream.simulation.city import build_city
+from tilestream.simulation.drive import scans
 from tilestream.simulation.settings import SimulationSettings, load_preset
 
 LIMITS = (0.10, 0.15, 0.20, 0.25)
@@ -33,23 +40,28 @@ PAPER = {
     "all": (41.9, 17.8, 8.45, 4.31),
 }
 """Table I of the paper: share of sample points beyond each of `LIMITS` [%]."""
-OFF: dict[str, dict[str, dict[str, Any]]] = {
+OF_THE_DRIVE: dict[str, dict[str, dict[str, Any]]] = {
     "as it is": {},
     "no blind sector": {"lidar": {"blind_deg": 0.0}},
     "range 100 m": {"lidar": {"range_max": None}},
-    "no map drift": {"survey": {"drift": 0.0}},
-    "no map noise": {"survey": {"noise": 0.0}},
-    "no ghosts in the map": {"survey": {"traffic": 0.0}},
-    "dense map": {"survey": {"rays_per_m": 30_000}},
     "nothing moves": {"traffic": {"cars_per_100m": 0.0, "people_per_100m": 0.0}},
-    "cars parked as mapped": {"traffic": {"reparked": 0.0}},
-    "leaves as mapped": {"traffic": {"regrown": False}},
-    "no trees, no hedges": {"city": {"vegetation": 0.0}},
+    "parked cars and leaves as mapped": {"traffic": {"reparked": 0.0, "regrown": False}},
     "no motion distortion": {"lidar": {"distortion": False}},
     "no beam bias": {"lidar": {"beam_bias": 0.0}},
+}
+"""What is switched off in the drive, one at a time; the map stays."""
+OF_THE_MAP: dict[str, dict[str, dict[str, Any]]] = {
+    "as it is": {},
+    "no drift": {"survey": {"drift": 0.0}},
+    "no noise": {"survey": {"noise": 0.0}},
+    "no ghosts": {"survey": {"traffic": 0.0}},
+    "30 000 rays per m": {"survey": {"rays_per_m": 30_000}},
+    "no trees, no hedges": {"city": {"vegetation": 0.0}},
     "flat facades": {"city": {"relief": 0.0}},
 }
-"""What is switched off, one at a time."""
+"""What is switched off in the city or its map, one at a time: simulated anew."""
+REACH = 110.0
+"""How far from a scan its map reaches [m]."""
 
 
 def labels(
@@ -65,6 +77,8 @@ def labels(
         simulate(settings, folder, paths=paths, client=client)
         store = ts.ingest(str(folder / "survey" / "*.laz"), folder / "map.zarr", client=client)
         for log in sorted((folder / "logs" / f"drive{settings.drive}").glob("*.mcap")):
+            if paths is not None and log.stem not in paths:
+                continue
             table = ts.localize(
                 store,
                 log,
@@ -107,26 +121,69 @@ def ceiling(first: dict[str, pd.Series], second: dict[str, pd.Series]) -> str:
     return "\n".join(lines)
 
 
-def knobs(
-    settings: SimulationSettings, folder: Path, every: int, workers: int, paths: list[str]
+def changed(settings: SimulationSettings, changes: dict[str, dict[str, Any]]) -> SimulationSettings:
+    """The settings with some fields of their parts set otherwise."""
+    parts = {
+        part: getattr(settings, part).model_copy(update=values) for part, values in changes.items()
+    }
+    return settings.model_copy(update=parts)
+
+
+def knobs_of_the_drive(settings: SimulationSettings, folder: Path, every: int) -> None:
+    """Print what the drive's knobs move, at every n-th sample point in the map of the folder."""
+    store = ts.ingest(str(folder / "survey" / "*.laz"), folder / "map.zarr")
+    city = build_city(settings, check=False)
+    places = [
+        (street, point)
+        for street in city.streets
+        if street.driven
+        for point in range(every // 2, len(street.xy), every)
+    ]
+    maps = [ts.cells_of(_points_around(store, street.xy[point])) for street, point in places]
+    matcher = ts.RegistrationSettings.autoware()
+    usual = None
+    for name, changes in OF_THE_DRIVE.items():
+        other = replace(city, settings=changed(settings, changes))
+        error = []
+        for (street, point), cells in zip(places, maps, strict=True):
+            scan = next(iter(scans(other, street, (point, point + 1))))
+            assert scan.T_map_lidar is not None
+            label = ts.localization_error(cells, scan.points, scan.T_map_lidar, settings=matcher)
+            error.append(label.error_mean)
+        found = pd.Series(error)
+        usual = found if usual is None else usual
+        print(row_of(name, found, usual), flush=True)
+
+
+def _points_around(store: ts.TileStore, place: Float64) -> Float64:
+    """The map points of all tiles within reach of a place."""
+    there = set(store.keys())
+    keys = [key for key in store.grid.keys_over(box_around(place[None], REACH)) if key in there]
+    return np.concatenate([store.tile(key).points() for key in keys])
+
+
+def knobs_of_the_map(
+    settings: SimulationSettings,
+    folder: Path,
+    every: int,
+    workers: int,
+    paths: list[str] | None,
 ) -> None:
-    """Print, for each knob switched off, the shares beyond each limit, the mean and the median."""
-    print("| | > 10 cm | > 15 | > 20 | > 25 | mean | median | moved |")
-    print("|---" * 8 + "|")
-    usual: pd.Series | None = None
-    for name, changes in OFF.items():
-        parts = {
-            part: getattr(settings, part).model_copy(update=values)
-            for part, values in changes.items()
-        }
-        place = folder / name.replace(" ", "-")
-        found = labels(settings.model_copy(update=parts), place, every, workers, paths)
-        error = pd.concat(found)
-        usual = error if usual is None else usual
-        shares = [f"{100 * (error > limit).mean():.1f}" for limit in LIMITS]
-        centre = [f"{100 * error.mean():.1f}", f"{100 * error.median():.1f}"]
-        moved = f"{100 * (error - usual).abs().mean():.1f}"
-        print("| " + " | ".join([name, *shares, *centre, moved]) + " |", flush=True)
+    """Print what the knobs of city and map move, on some paths, simulated anew for each."""
+    usual = None
+    for name, changes in OF_THE_MAP.items():
+        place = folder / "knobs" / name.replace(",", "").replace(" ", "-")
+        found = pd.concat(labels(changed(settings, changes), place, every, workers, paths))
+        usual = found if usual is None else usual
+        print(row_of(name, found, usual), flush=True)
+
+
+def row_of(name: str, error: pd.Series, usual: pd.Series) -> str:
+    """Markdown: shares beyond each limit, mean and median, mean change against the usual."""
+    shares = [f"{100 * (error > limit).mean():.1f}" for limit in LIMITS]
+    centre = [f"{100 * value:.1f}" for value in (error.mean(), error.median())]
+    moved = f"{100 * (error - usual).abs().mean():.1f}"
+    return "| " + " | ".join([name, str(len(error)), *shares, *centre, moved]) + " |"
 
 
 def main() -> None:
@@ -138,13 +195,18 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("shinjuku-paper"))
     parser.add_argument("--every", type=int, default=10)
     parser.add_argument("--drives", type=int, nargs="+", default=[0])
-    parser.add_argument("--knobs", action="store_true")
-    parser.add_argument("--paths", nargs="+", default=["III", "V"], help="of --knobs")
+    parser.add_argument("--knobs", choices=("drive", "map"))
+    parser.add_argument("--paths", nargs="+", help="only these; all by default")
     parser.add_argument("--workers", type=int, default=1)
     given = parser.parse_args()
     settings = load_preset(given.preset)
-    if given.knobs:
-        knobs(settings, given.out / "knobs", given.every, given.workers, given.paths)
+    if given.knobs is not None:
+        print("| switched off | points | > 10 cm | > 15 | > 20 | > 25 | mean | median | moved |")
+        print("|---" * 9 + "|", flush=True)
+        if given.knobs == "drive":
+            knobs_of_the_drive(settings, given.out, given.every)
+        else:
+            knobs_of_the_map(settings, given.out, given.every, given.workers, given.paths)
         return
     found = [
         labels(settings.model_copy(update={"drive": drive}), given.out, given.every, given.workers)
