@@ -13,9 +13,12 @@ from tilestream.dataflow.ingest_map import ingest as ingest
 from tilestream.dataflow.localize_drive import localize as localize
 from tilestream.dataflow.main_job import dataset as dataset
 from tilestream.dataflow.main_job import run as run
+from tilestream.dataflow.observe_route import observe_along as observe_along
 from tilestream.dataflow.run_settings import RunSettings as RunSettings
+from tilestream.factors.observability import observability as observability
 from tilestream.factors.sample_points import sample_points as sample_points
 from tilestream.factors.table import factors as factors
+from tilestream.factors.virtual_scan import VirtualSettings as VirtualSettings
 from tilestream.formats.mcap import ScanSelection as ScanSelection
 from tilestream.formats.routes import read_route as read_route
 from tilestream.formats.routes import read_routes as read_routes

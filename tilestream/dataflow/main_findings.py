@@ -84,8 +84,9 @@ def labels_of(
         said = places.rename(columns={"route_id": "path", "estimate": "held_out"})
     else:
         said = points.rename(columns={"estimate": "held_out"})
-    said = said[["path", "arc_length", "held_out"]]
-    return dataset.rows.merge(said, on=["path", "arc_length"], how="left")
+    kept = ["held_out"] if points is not None else ["held_out", "low", "high"]
+    said = said[["path", "arc_length", *kept]]
+    return dataset.rows.merge(said, on=["path", "arc_length"], how="left", validate="many_to_one")
 
 
 def evaluation_of(

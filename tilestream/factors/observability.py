@@ -48,7 +48,7 @@ Row = dict[str, object]
 """A row of the table by column, without what is missing."""
 
 
-def _column(name: str, unit: str, meaning: str, source: str = "issue 8") -> Column:
+def _column(name: str, unit: str, meaning: str, source: str = "definitions, section 4") -> Column:
     return Column(name, "OB", unit, meaning, source, "observability")
 
 
