@@ -21,6 +21,7 @@ from rich.logging import RichHandler
 from tilestream.cli.progress import err, progress
 from tilestream.cli.tables import (
     TILE_CHANGES,
+    comparison_table,
     diff_table,
     error_facts,
     error_table,
@@ -34,7 +35,8 @@ from tilestream.cli.tables import (
 )
 from tilestream.config import IngestSettings, RegistrationSettings, StartSettings
 from tilestream.dataflow import ingest_map, main_job
-from tilestream.dataflow.dashboard import page_url
+from tilestream.dataflow.compare import SPACING, choices_of, plan_compare
+from tilestream.dataflow.compare import compare as compare_choices
 from tilestream.dataflow.factors_route import factors_along, plan_factors
 from tilestream.dataflow.factors_tasks import Looking
 from tilestream.dataflow.localize_drive import localize as localize_drive
@@ -46,6 +48,7 @@ from tilestream.dataflow.run import dask_client
 from tilestream.dataflow.run_settings import RunSettings, read_settings
 from tilestream.dataflow.simulate import SCENE_BYTES
 from tilestream.dataflow.simulate import simulate as simulate_city
+from tilestream.dataflow.telling import page_url
 from tilestream.errors import (
     LimitError,
     PartialError,
@@ -56,11 +59,14 @@ from tilestream.errors import (
     UsageError,
 )
 from tilestream.factors.catalogue import Which
+from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.formats import describe
 from tilestream.formats.mcap import ScanSelection
 from tilestream.formats.routes import read_routes
 from tilestream.records import TruePose
 from tilestream.report import exceeds
+from tilestream.report.comparison_page import write_comparison
+from tilestream.report.judgement import check_threshold
 from tilestream.sensors import SENSORS, Sensor
 from tilestream.simulation.settings import load_preset
 from tilestream.store import POINTS, TileStore, open_store
@@ -321,7 +327,7 @@ def factors(
     """Compute the factors of the map at every sample point of a route."""
     allowed, opened = parse_bytes(memory), open_store(store)
     routes = [found for path in route for found in read_routes(path, project_to=project_to)]
-    seen_by = SENSORS[sensor] if sensor in SENSORS else read_sensor(sensor)
+    seen_by = sensor_of(sensor)
     if dry_run:
         looking = Looking(seen_by, cell_size, which, sensor_height)
         out.print(plan_table(plan_factors(opened, routes, folder, spacing, looking, allowed)))
@@ -350,6 +356,98 @@ def factors(
         bad = rows[rows["status"] != "done"].groupby("reason").size()
         reasons = {str(reason): f"{count} sample points" for reason, count in bad.items()}
         raise PartialError(f"{store}: not every sample point has factors:", reasons)
+
+
+@app.command()
+def compare(
+    store: Annotated[str, typer.Argument(help="The tile store.")],
+    route: Annotated[list[str], typer.Option(help="TUM, KITTI, CSV, GeoJSON, Lanelet2 or MCAP.")],
+    folder: Annotated[str, typer.Option("--out", help="Folder of the page and the tables.")],
+    sensor: Annotated[
+        list[str], typer.Option(help=f"{', '.join(SENSORS)}, or a YAML file; several times.")
+    ] = ["VLP16"],  # noqa: B006 - as below: typer's way to name a default
+    cell_size: Annotated[
+        list[str], typer.Option(help="Edges of the NDT cells [m], e.g. 1.0,2.0.")
+    ] = ["2.0"],  # noqa: B006
+    ranges: Annotated[
+        list[str], typer.Option("--range", help="Usable ranges [m], e.g. 30,60; default: all.")
+    ] = [],  # noqa: B006
+    blind_rear: Annotated[
+        list[str], typer.Option(help="Blind sectors at the rear [deg], e.g. 0,120.")
+    ] = ["0"],  # noqa: B006
+    matcher: Annotated[Matcher, typer.Option(help="Ours, or the production matcher.")] = "default",
+    spacing: Annotated[float, typer.Option(help="Between sample points [m].")] = SPACING,
+    cap: Annotated[
+        float, typer.Option(help="What 95 % of a tile's estimates must stay within [m].")
+    ] = 0.15,
+    threshold: Annotated[float, typer.Option(help="Estimates above are too large [m].")] = 0.25,
+    sensor_height: Annotated[float, typer.Option(help="Of the lidar above the road [m].")] = 2.0,
+    project_to: Annotated[str | None, typer.Option(help="CRS for routes in degrees.")] = None,
+    memory: Annotated[str, MEMORY] = "1GB",
+    scheduler: Annotated[str | None, SCHEDULER] = None,
+    workers: Annotated[int, WORKERS] = 1,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan, do nothing.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="For machines.")] = False,
+) -> None:
+    """Compare lidars, ranges and map resolutions along routes, from the map alone."""
+    for limit in (threshold, cap):
+        check_threshold(limit)
+    allowed, opened = parse_bytes(memory), open_store(store)
+    routes = [found for path in route for found in read_routes(path, project_to=project_to)]
+    choices = choices_of(
+        [sensor_of(name) for name in sensor],
+        numbers(ranges, "--range") or (None,),
+        numbers(blind_rear, "--blind-rear"),
+        numbers(cell_size, "--cell-size"),
+    )
+    preset = RegistrationSettings.autoware if matcher == "autoware" else RegistrationSettings
+    if dry_run:
+        how = (spacing, preset(), sensor_height, VirtualSettings(), allowed)
+        out.print(plan_table(plan_compare(opened, routes, folder, choices, *how)))
+        return
+    with dask_client(scheduler, workers, allowed) as client, progress() as watch:
+        found = compare_choices(
+            opened,
+            routes,
+            folder,
+            choices,
+            spacing=spacing,
+            registration=preset(),
+            sensor_height=sensor_height,
+            client=client,
+            memory=allowed,
+            watch=watch,
+        )
+    content = write_comparison(found, folder, threshold=threshold, cap=cap)
+    if as_json:
+        print_json(content)
+    else:
+        out.print(comparison_table(content))
+        page = (Path(folder) / "compare.html").absolute()
+        out.print(f"The page is at {page}", highlight=False, soft_wrap=True)
+    if not any(choice["estimated"] for choice in content["choices"]):
+        reasons = content["choices"][0]["missing"]
+        failures = {str(reason): f"{count} sample points" for reason, count in reasons.items()}
+        raise PartialError(f"{store}: no sample point has an estimate:", failures)
+
+
+def numbers(lists: list[str], option: str) -> list[float]:
+    """The numbers of an option that takes several, also with commas between them.
+
+    Raises:
+        UsageError: one is no number.
+    """
+    parts = [part.strip() for text in lists for part in text.split(",")]
+    try:
+        return [float(part) for part in parts]
+    except ValueError:
+        told = ", ".join(lists)
+        raise UsageError(f"{option} {told}: give numbers, with commas between them") from None
+
+
+def sensor_of(name: str) -> Sensor:
+    """A sensor by its name, or from a YAML file; raises as `read_sensor`."""
+    return SENSORS[name] if name in SENSORS else read_sensor(name)
 
 
 def read_sensor(path: str) -> Sensor:

@@ -189,3 +189,18 @@ def diff_table(found: MapDiff) -> Table:
         where = f"{row.route_id} at {row.arc_length:.0f} m"
         table.add_row(where, "", f"{row.before:.3g} m to {row.after:.3g} m")
     return table
+
+
+def comparison_table(content: dict[str, Any]) -> Table:
+    """The choices of a comparison, a line each."""
+    over = f"over {content['threshold']:g} m"
+    table = Table(title="comparison", title_justify="left", box=SIMPLE)
+    table.add_column("choice", no_wrap=True)
+    for column in ("median [m]", "95 % [m]", "max [m]", over, "p_fail", "lost", "map [MB]"):
+        table.add_column(column, justify="right")
+    for choice in content["choices"]:
+        figures = (choice[name] for name in ("median", "p95", "max", "over_share", "p_fail"))
+        shown = ["none" if figure is None else f"{figure:.3f}" for figure in figures]
+        size = f"{choice['map_bytes'] / 1e6:,.2f}"
+        table.add_row(choice["choice"], *shown, f"{choice['lost']:,}", size)
+    return table
