@@ -27,7 +27,6 @@ from tilestream.dataflow.dashboard import (
     clock,
     failures_html,
     look,
-    page_url,
     stages_html,
     workers_html,
 )
@@ -42,6 +41,7 @@ from tilestream.dataflow.progress import (
     Progress,
 )
 from tilestream.dataflow.run import dask_client, execute
+from tilestream.dataflow.telling import page_url
 from tilestream.tiling import TileKey
 
 EVIL = "<img src=x onerror=\"document.title='taken'\"> & 'quotes'"

@@ -6,15 +6,15 @@ scans -> 317 registrations each -------> error per sample point -----+-> forest 
 ```
 """
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from tilestream.config import RegistrationSettings as RegistrationSettings
 from tilestream.config import StartSettings as StartSettings
 from tilestream.dataflow.factors_route import factors_along as factors_along
 from tilestream.dataflow.ingest_map import ingest as ingest
 from tilestream.dataflow.localize_drive import localize as localize
-from tilestream.dataflow.main_job import dataset as dataset
-from tilestream.dataflow.main_job import run as run
 from tilestream.dataflow.observe_route import observe_along as observe_along
-from tilestream.dataflow.run_settings import RunSettings as RunSettings
 from tilestream.factors.observability import observability as observability
 from tilestream.factors.sample_points import sample_points as sample_points
 from tilestream.factors.table import factors as factors
@@ -41,5 +41,22 @@ from tilestream.store import TileStore as TileStore
 from tilestream.store import open_store as open_store
 from tilestream.tiling import TileKey as TileKey
 from tilestream.version import VERSION
+
+if TYPE_CHECKING:
+    from tilestream.dataflow.main_job import dataset as dataset
+    from tilestream.dataflow.main_job import run as run
+    from tilestream.dataflow.run_settings import RunSettings as RunSettings
+
+
+def __getattr__(name: str) -> Any:
+    """The main job, when it is asked for: what it needs (scikit-learn, Bokeh, matplotlib) would
+    cost every worker process 100 MB that its tiles have a use for.
+    """
+    if name in ("run", "dataset"):
+        return getattr(import_module("tilestream.dataflow.main_job"), name)
+    if name == "RunSettings":
+        return import_module("tilestream.dataflow.run_settings").RunSettings
+    raise AttributeError(f"module 'tilestream' has no attribute {name!r}")
+
 
 __version__ = VERSION

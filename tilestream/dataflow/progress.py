@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+NAME = "tilestream"
+"""Of what the dashboard shows of a run: its plugin, its topic of events, its page and its route."""
 WAITING, RUNNING, DONE, FAILED, REFUSED = range(5)
 STATUSES = ("waiting", "running", "done", "failed", "refused")
 """Names of the statuses: refused is what was not run since a task that it needs had failed."""

@@ -18,9 +18,9 @@ from dask.system import CPU_COUNT
 from distributed.comm.core import CommClosedError
 from distributed.utils import silence_logging_cmgr
 
-from tilestream.dataflow.dashboard import telling
 from tilestream.dataflow.plan import Task, megabytes
 from tilestream.dataflow.tasks import NOT_RUN, Outcome, attempt
+from tilestream.dataflow.telling import telling
 from tilestream.errors import TaskError, UsageError
 
 logger = logging.getLogger(__name__)

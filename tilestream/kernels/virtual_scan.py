@@ -214,7 +214,6 @@ def _through_brick(voxels, surfels, edge, brick, start, p, d, t, t_out, near, be
     du = 1 if dx > 0.0 else -1
     dv = 1 if dy > 0.0 else -1
     dw = 1 if dz > 0.0 else -1
-    x, y, z = px - fx + i * BRICK * edge, py - fy + j * BRICK * edge, pz - fz + k * BRICK * edge
     cosine = 0.0
     while t <= t_out and t < best:
         s = voxels[(u * BRICK + v) * BRICK + w]
