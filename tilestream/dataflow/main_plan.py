@@ -100,10 +100,13 @@ def inputs_of(settings: RunSettings, client: Any | None, watch: Watch | None) ->
         for log in sorted((folder / "logs" / f"drive{drive}").glob("*.mcap"))
         if wanted.paths is None or log.stem in wanted.paths
     ]
+    routes = _routes(settings.routes or (str(folder / "routes.geojson"),), settings)
+    if wanted.paths is not None and not settings.routes:
+        routes = tuple(route for route in routes if route.route_id in wanted.paths)
     return Inputs(
         settings.map.sources or (str(folder / "survey" / "*.laz"),),
         settings.drives or tuple(logs),
-        _routes(settings.routes or (str(folder / "routes.geojson"),), settings),
+        routes,
         notes=(f"Simulated, preset {preset.preset}: {preset.note}",),
         attributions=(ATTRIBUTION,),
     )

@@ -321,7 +321,8 @@ def _begin(folder: Path, city: City, plan: Plan, identity: dict[str, Any]) -> No
         "buildings_left_out": dict(city.footprints.refused),
         "attribution": city.footprints.attribution,
     }
-    features = [_feature(street, city) for street in city.streets]
+    end = SMALL_POINTS if identity["size"] == "small" else None
+    features = [_feature(street, city, end) for street in city.streets]
     routes = {"type": "FeatureCollection", "features": features}
     _keep(folder / ROUTES, f"{json.dumps(routes)}\n")
     _keep(folder / RECORD, yaml.safe_dump(facts, sort_keys=True, allow_unicode=True))
@@ -334,10 +335,10 @@ def _keep(path: Path, text: str) -> None:
             file.write(text.encode())
 
 
-def _feature(street: Street, city: City) -> dict[str, Any]:
-    """A street as GeoJSON, with the height of its road."""
+def _feature(street: Street, city: City, end: int | None) -> dict[str, Any]:
+    """A street as GeoJSON, as far as it is simulated, with the height of its road."""
     motion = motion_of(street, city.settings, 0.0)
-    line = motion.pose(city.ground, street.arc)[:, :3, 3]
+    line = motion.pose(city.ground, street.arc[:end])[:, :3, 3]
     properties = {
         "name": street.name,
         "kind": street.kind,
