@@ -31,6 +31,7 @@ from tilestream.forest.models import (
     PAPER,
     Recipe,
     grow,
+    telling,
     tuned,
 )
 from tilestream.forest.protocols import Split, block_splits, leave_path_out, random_split
@@ -115,6 +116,8 @@ def test_a_forest_of_logarithms_is_near_the_median() -> None:
 
 @pytest.mark.parametrize("name", sorted(COMPETITORS))
 def test_every_competitor_estimates_what_it_has_not_seen(name: str, caused: Dataset) -> None:
+    seen = caused.rows[caused.names[0]].abs()  # physics asks for it
+    caused = replace(caused, rows=caused.rows.assign(vd_mean=seen))
     rows = np.arange(len(caused))
     split = Split("half", rows[::3], rows[1::3])
     blind = replace(caused, rows=caused.rows.copy())
@@ -257,3 +260,22 @@ def test_coverage_of_a_path_is_calibrated_elsewhere() -> None:
     assert found.loc["c", "covered"] == 0.0
     assert found.loc["c", "factor"] == pytest.approx(1.2)
     assert found.loc["a", "covered"] == 1.0
+
+
+def test_the_default_forest_learns_from_observability_alone_where_it_is_there() -> None:
+    plain = dataset(1, lengths={"a": 120})
+    assert telling(plain).names == plain.names
+    seen = replace(plain.columns[0], factor_set="observability")
+    mixed = replace(plain, columns=(seen, *plain.columns[1:]))
+    assert telling(mixed).names == [seen.name]
+
+
+def test_physics_adds_one_number_to_the_virtual_drive() -> None:
+    plain = dataset(1, lengths={"a": 120})
+    rows = np.arange(len(plain))
+    split = [Split("half", rows[:60], rows[60:])]
+    seen = replace(plain, rows=plain.rows.assign(vd_mean=plain.label() - 0.03))
+    points = held_out(seen, split, "physics")
+    np.testing.assert_allclose(points["estimate"], points["actual"])
+    with pytest.raises(ModelError, match="no virtual drive"):
+        held_out(plain, split, "physics")

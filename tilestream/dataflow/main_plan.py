@@ -354,7 +354,7 @@ def judges(join: JoinTask, folder: str, seed: int, observed: bool) -> list[Task]
     known = [name for name in COMPETITORS if observed or name not in PHYSICS]
     wanted = [(MAIN, competitor, "") for competitor in known]
     wanted += [(MAIN, "paper", name) for name in sets]
-    wanted += [(MAIN, "default", name) for name in sets if "LS" in name or "ob" in name]
+    wanted += [(MAIN, "default", name) for name in sets if "LS" in name and "ob" not in name]
     simple = ["default", *(name for name in known if name in (*PHYSICS, *OPPONENTS))]
     wanted += [
         (target, name, "") for target in PARTS for name in simple if name != "footprint forest"

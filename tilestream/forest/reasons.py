@@ -41,6 +41,22 @@ DILUTED = "directions that leave a position weak"
 SPANNED = "directions spread all round"
 LOOSE = "much of the map in cells with too few points"
 DENSE = "dense cells throughout"
+SLIDES_ALONG = "a virtual drive slides along the road"
+SLIDES_ACROSS = "a virtual drive slides across the road"
+SINKS = "a virtual drive rises or sinks"
+DRIFTS = "a virtual drive does not hold its place"
+LOST = "a virtual drive gets lost from many starts"
+HOLDS = "a virtual drive holds its place"
+WEAK = "nothing fixes the position in one direction"
+FIRM = "every direction is well fixed"
+TURNS = "nothing fixes the heading"
+HEIGHT = "nothing fixes the height"
+UNLIKE = "the map blurs what a scan would see there"
+ALIKE = "the map is just what a scan would see there"
+UNSEEN = "few beams would come back"
+SEEN = "beams come back from everywhere"
+UNMAPPED = "much of the view is not in the map"
+MAPPED = "all of the view is in the map"
 
 PHRASES: dict[str, tuple[str, str]] = {
     "feature_count": (FEW, CROWDED),
@@ -85,6 +101,25 @@ PHRASES: dict[str, tuple[str, str]] = {
     "bhatt_sim": (REPEATED, IRREGULAR),
     "pfh_mean": (REPEATED, IRREGULAR),
     "bhatt_mean": (REPEATED, IRREGULAR),
+    "ob_info_along": (ALONG, FIRM),
+    "ob_info_across": (ACROSS, FIRM),
+    "ob_info_up": (HEIGHT, FIRM),
+    "ob_info_yaw": (TURNS, FIRM),
+    "ob_weak_info": (WEAK, FIRM),
+    "ob_weak_angle": (ALONG, ACROSS),
+    "ob_score": (UNLIKE, ALIKE),
+    "ob_nvtl": (UNLIKE, ALIKE),
+    "ob_points": (UNSEEN, SEEN),
+    "ob_cells": (FEW, CROWDED),
+    "ob_returns": (UNSEEN, SEEN),
+    "ob_unmapped": (MAPPED, UNMAPPED),
+    "vd_mean": (HOLDS, DRIFTS),
+    "vd_floor": (HOLDS, DRIFTS),
+    "vd_tail": (HOLDS, LOST),
+    "vd_p_fail": (HOLDS, LOST),
+    "vd_along": (HOLDS, SLIDES_ALONG),
+    "vd_across": (HOLDS, SLIDES_ACROSS),
+    "vd_up": (HOLDS, SINKS),
 }
 """What a value below, or above, that of a typical training place says about a place."""
 

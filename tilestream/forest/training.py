@@ -12,7 +12,7 @@ from tilestream.errors import ModelError, UsageError
 from tilestream.forest.dataset import TARGETS, Dataset, with_derived
 from tilestream.forest.domain import Domain, domain_of
 from tilestream.forest.intervals import LEVEL, NOT_CALIBRATED, Interval, calibrate
-from tilestream.forest.models import PAPER, Forest, Recipe, grow, tuned
+from tilestream.forest.models import PAPER, Forest, Recipe, grow, telling, tuned
 from tilestream.forest.protocols import block_splits
 from tilestream.forest.reasons import contributions, in_words
 from tilestream.records import Column, Float64
@@ -110,6 +110,7 @@ def train(
     if recipe not in RECIPES:
         raise UsageError(f"no recipe {recipe!r}: choose from {', '.join(RECIPES)}")
     dataset.check(MAIN)
+    dataset = dataset if recipe == "paper" else telling(dataset)
     grown = PAPER if recipe == "paper" else tuned(dataset, MAIN, seed, n_jobs)
     # An axis or a tail that is the same everywhere teaches nothing and is learnt as that constant.
     there = [target for target in TARGETS if target in dataset.rows]
