@@ -1,8 +1,6 @@
 """What the README shows works."""
 
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -69,12 +67,9 @@ def test_both_commands_are_one_line_each_and_ci_runs_the_second() -> None:
     assert r"grep -m 1 '\.venv/bin/pytest' README.md" in (ROOT / ".ci" / "run").read_text()
 
 
-def test_every_command_of_the_table_has_help() -> None:
-    for command in re.findall(r"^\| `tilestream (\w+)", README, flags=re.MULTILINE):
-        shown = subprocess.run(
-            [sys.executable, "-m", "tilestream", command, "--help"],
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        assert command in shown.stdout
+def test_every_command_of_the_table_has_help(capsys: pytest.CaptureFixture) -> None:
+    commands = re.findall(r"^\| `tilestream (\w+)", README, flags=re.MULTILINE)
+    assert len(commands) >= 10
+    for command in commands:
+        assert run([command, "--help"]) == 0
+        assert f"tilestream {command}" in capsys.readouterr().out
