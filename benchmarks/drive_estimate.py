@@ -1,0 +1,48 @@
+"""Estimated against measured errors of a run, drive by drive, for RESULTS.md.
+
+    tilestream run pipelines/drive.yaml
+    python benchmarks/drive_estimate.py drive
+
+Read from the run directory. Lengths are centimetres.
+"""
+
+import argparse
+from pathlib import Path
+
+import pandas as pd
+from scipy.stats import spearmanr
+
+import tilestream as ts
+
+CM = 100.0
+
+
+def table(run_dir: Path) -> str:
+    """Markdown: a row per drive."""
+    places = pd.read_parquet(run_dir / "report" / "places.parquet")
+    said = places[["route_id", "arc_length", "estimate", "low", "high"]]
+    said = said.rename(columns={"route_id": "path"})
+    rows = ts.dataset(run_dir).rows.merge(said, on=["path", "arc_length"], validate="many_to_one")
+    lines = [
+        "| drive | points | measured, mean | median | estimated, median | MAE | Spearman | held |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for name, part in rows.groupby("group"):
+        error, estimate = part["error_mean"], part["estimate"]
+        held = ((part["low"] <= error) & (error <= part["high"])).mean()
+        figures = (error.mean(), error.median(), estimate.median(), (error - estimate).abs().mean())
+        lengths = " | ".join(f"{CM * value:.1f}" for value in figures)
+        rho = spearmanr(error, estimate).statistic
+        lines.append(f"| {name} | {len(part)} | {lengths} | {rho:.2f} | {CM * held:.0f} % |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Print the table of a run directory."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("run_dir", type=Path)
+    print(table(parser.parse_args().run_dir))
+
+
+if __name__ == "__main__":
+    main()
