@@ -46,9 +46,12 @@ class Told:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def small_forests() -> Iterator[None]:
-    """Five trees instead of a hundred: these tests are about the job, not about the forest."""
+def small_forests(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Five trees instead of a hundred: these tests are about the job, not about the forest. What
+    they learn of costs stays here.
+    """
     with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         quick = Recipe(trees=5)
         patch.setattr(models, "PAPER", quick)
         patch.setattr(models, "CANDIDATES", (Recipe(trees=4, leaf=2, log=True),))

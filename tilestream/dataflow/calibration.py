@@ -9,25 +9,23 @@ from tilestream.dataflow.plan import Task
 from tilestream.dataflow.tasks import Outcome
 
 SECONDS_PER_WORK: Mapping[str, float] = {
-    "survey": 0.05,
-    "scan": 0.1,
-    "log": 0.02,
-    "scatter": 1e-6,
-    "merge": 0.3,
-    "cells": 0.2,
-    "terms": 2.4,
+    "scatter": 5.5e-8,
+    "merge": 0.1,
+    "cells": 0.12,
+    "terms": 1.6,
     "factors": 0.002,
-    "observe": 0.06,
-    "register": 0.4,
-    "label": 0.002,
-    "join": 2.0,
-    "judge": 20.0,
-    "weigh": 60.0,
-    "train": 30.0,
-    "predict": 0.001,
+    "surfels": 0.7,
+    "observe": 0.18,
+    "register": 0.45,
+    "label": 0.006,
+    "join": 5.0,
+    "judge": 45.0,
+    "weigh": 100.0,
+    "train": 80.0,
+    "predict": 0.004,
 }
-"""Before the first run: seconds per unit of work (tile, scan, sample point, …) of each stage, on
-the machine of benchmarks/RESULTS.md."""
+"""Before the first run: seconds per unit of work (point, tile, scan, sample point) of each stage,
+as in the runs of benchmarks/RESULTS.md, rounded; a run replaces them."""
 LEAST = 0.03
 """Tasks that took less found their work done, or tell nothing [s]."""
 
