@@ -1,6 +1,8 @@
 """The factors job: the same tables from any tiling, workers and interruptions; bad places named."""
 
 import json
+import pickle
+import tracemalloc
 from pathlib import Path
 
 import distributed
@@ -13,9 +15,11 @@ from scenes import PLACES
 import tilestream as ts
 from tilestream.cli import run
 from tilestream.errors import SourceError, UsageError
+from tilestream.factors.rows import samples_by_tile
 from tilestream.formats.pcd import write_pcd
-from tilestream.formats.routes import route_of, write_geojson_route
+from tilestream.formats.routes import resample, route_of, write_geojson_route
 from tilestream.store import POINTS, Mark, Tile
+from tilestream.tiling import TileGrid
 
 SENSOR = ts.VLP16.model_copy(update={"name": "short", "range_max": 25.0})
 
@@ -56,6 +60,42 @@ def test_rows_follow_the_route_and_say_what_the_factors_of_their_places_are(
     assert (table["status"] == "done").all()
     direct = ts.factors(store, points.positions, sensor=SENSOR, which="all")
     pd.testing.assert_frame_equal(table[direct.columns.tolist()], direct, check_dtype=False)
+
+
+def winding(name: str, seed: int) -> ts.Route:
+    """A route of some kilometres that crosses itself, without z."""
+    steps = np.random.default_rng(seed).normal([15.0, 5.0], 30.0, (80, 2))
+    return route_of(name, np.column_stack([steps.cumsum(axis=0), np.full(80, np.nan)]))
+
+
+def test_the_tiles_part_the_sample_points_among_them() -> None:
+    grid, routes = TileGrid.of(100.0, 10.0), [winding("a", 1), winding("b", 2)]
+    wanted: dict[ts.TileKey, list[tuple[object, ...]]] = {}
+    for each in routes:
+        points = resample(each, 3.0)
+        for n, (x, y, _) in enumerate(points.positions.tolist()):
+            row = (each.route_id, n, points.arc_length[n], points.heading[n], x, y)
+            wanted.setdefault(grid.key_at(x, y), []).append(row)
+    found = samples_by_tile(grid, routes, 3.0)
+    assert list(found) == sorted(wanted)
+    for key, samples in found.items():
+        rows = [(samples.route_ids[r], *rest) for r, *rest, _ in samples.rows.tolist()]
+        assert rows == wanted[key]
+        assert np.isnan(samples.rows["z"]).all()
+
+
+def test_a_sample_point_of_a_plan_is_fifty_bytes() -> None:
+    routes = [winding(str(n), n) for n in range(10)]
+    tracemalloc.start()
+    try:
+        samples = samples_by_tile(TileGrid.of(100.0, 10.0), routes, 0.5)
+        held, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    count = sum(len(part) for part in samples.values())
+    assert count > 50_000
+    assert held < 52 * count
+    assert sum(len(pickle.dumps(part)) for part in samples.values()) < 52 * count
 
 
 def test_sample_points_lie_a_sensor_height_above_the_ground(
@@ -109,6 +149,20 @@ def test_what_is_done_is_not_done_again_and_a_changed_map_is(
     there = (first["x"] < 20.0) & (first["y"] < 0.0)
     assert sum(r for r in results if isinstance(r, int)) == there.sum() > 0
     assert work(sensor_height=1.0)["z"].tolist() != first["z"].tolist()
+
+
+def test_a_route_elsewhere_redoes_nothing_here(
+    store: ts.TileStore, route: ts.Route, tmp_path: Path
+) -> None:
+    rows: dict[str, object] = {}
+    watch = lambda outcome, *_: rows.update({outcome.key: outcome.result})  # noqa: E731
+    how: dict[str, object] = {"spacing": 6.0, "sensor": SENSOR, "watch": watch}
+    alone = ts.factors_along(store, [route], tmp_path, **how)
+    here = {key for key in rows if key.startswith("factors")}
+    away = route_of("away", np.array([[100.0, 50.0, 0.0], [112.0, 50.0, 0.0]]))
+    both = ts.factors_along(store, [away, route], tmp_path, **how)
+    assert {rows[key] for key in here} == {0}
+    pd.testing.assert_frame_equal(both[3:].reset_index(drop=True), alone)
 
 
 def test_every_column_is_documented_in_the_file(table: pd.DataFrame, street: Path) -> None:

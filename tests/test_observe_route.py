@@ -16,6 +16,7 @@ from tilestream.dataflow.observe_tasks import Observing
 from tilestream.dataflow.plan import DEFAULT_MEMORY
 from tilestream.errors import PlanError, UsageError
 from tilestream.factors.observability import observability
+from tilestream.factors.rows import samples_by_tile
 from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.formats.pcd import write_pcd
 from tilestream.formats.routes import route_of
@@ -141,14 +142,15 @@ def test_places_without_map_are_rows_that_say_so(store: ts.TileStore, tmp_path: 
 
 def test_the_plan_says_what_it_needs(store: ts.TileStore, route: ts.Route, tmp_path: Path) -> None:
     observing = Observing(SENSOR, SEEING, ts.RegistrationSettings(), 2.0, 2.0)
-    plan = plan_observe(store, [route], tmp_path, 6.0, observing, DEFAULT_MEMORY)
+    samples = samples_by_tile(store.grid, [route], 6.0)
+    plan = plan_observe(store, samples, tmp_path, observing, DEFAULT_MEMORY)
     assert [stage for stage, *_ in plan.describe()] == ["cells", "surfels", "observe"]
     observe = [task for task in plan.tasks if task.stage == "observe"]
     assert sum(task.work for task in observe) == 9
     known = {task.key for task in plan.tasks}
     assert all(set(task.needs) <= known for task in observe)
     with pytest.raises(PlanError, match="allow more"):
-        plan_observe(store, [route], tmp_path, 6.0, observing, 10**8)
+        plan_observe(store, samples, tmp_path, observing, 10**8)
     for routes in ([], [route, route]):
         with pytest.raises(UsageError, match="its own name"):
             observe_along(store, routes, tmp_path / "out")

@@ -59,6 +59,7 @@ from tilestream.errors import (
     UsageError,
 )
 from tilestream.factors.catalogue import Which
+from tilestream.factors.rows import samples_by_tile
 from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.formats import describe
 from tilestream.formats.mcap import ScanSelection
@@ -330,7 +331,8 @@ def factors(
     seen_by = sensor_of(sensor)
     if dry_run:
         looking = Looking(seen_by, cell_size, which, sensor_height)
-        out.print(plan_table(plan_factors(opened, routes, folder, spacing, looking, allowed)))
+        samples = samples_by_tile(opened.grid, routes, spacing)
+        out.print(plan_table(plan_factors(opened, samples, folder, looking, allowed)))
         return
     with dask_client(scheduler, workers, allowed) as client, progress() as watch:
         rows = factors_along(

@@ -20,6 +20,7 @@ from tilestream.dataflow.observe_tasks import ObserveTask, Observing
 from tilestream.dataflow.plan import DEFAULT_MEMORY, Plan, Task
 from tilestream.dataflow.run import Watch, execute
 from tilestream.errors import PartialError, UsageError
+from tilestream.factors.rows import samples_by_tile
 from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.records import Route
 from tilestream.report.comparison import CELL_COLUMNS, ROW_COLUMNS, USUAL, Comparison
@@ -192,15 +193,14 @@ def plan_compare(
     sizes_mm = sorted({whole_mm(choice.cell_size, "cell_size") for choice in choices})
     require_sizes(store, sizes_mm)
     have = store.identities()
+    samples = samples_by_tile(store.grid, routes, spacing)
     tasks: dict[str, Task] = {}
     for choice in choices:
         observing = Observing(
             choice.sensor, choice.seeing(seeing), registration, choice.cell_size, sensor_height
         )
         folder = f"{os.fspath(out)}/{choice.name}"
-        planned = plan_observe(
-            store, routes, folder, spacing, observing, memory, have, group=choice.name
-        )
+        planned = plan_observe(store, samples, folder, observing, memory, have, group=choice.name)
         tasks |= {task.key: task for task in planned.tasks if task.key not in tasks}
     usual_mm = whole_mm(USUAL, "cell_size")
     counted = {*sizes_mm, usual_mm} if store.grid.tile_mm % usual_mm == 0 else set(sizes_mm)

@@ -1,19 +1,18 @@
 """The job that looks at the map: routes in, the factors of every sample point out."""
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from tilestream.dataflow.factors_tasks import FactorsTask, Looking, TermsTask, facts
 from tilestream.dataflow.localize_tasks import CellsTask, box_around
 from tilestream.dataflow.plan import DEFAULT_MEMORY, Plan, Task
 from tilestream.dataflow.run import Watch, execute
-from tilestream.errors import PartialError, UsageError
+from tilestream.errors import PartialError
 from tilestream.factors.catalogue import Which
-from tilestream.factors.rows import samples_by_tile
+from tilestream.factors.rows import Samples, samples_by_tile
 from tilestream.factors.terms import reach_mm, terms_inputs
 from tilestream.records import Route
 from tilestream.sensors import VLP16, Sensor
@@ -67,7 +66,7 @@ def factors_along(
     """
     routes = list(routes)
     looking = Looking(sensor, cell_size, which, sensor_height)
-    plan = plan_factors(store, routes, out, spacing, looking, memory)
+    plan = plan_factors(store, samples_by_tile(store.grid, routes, spacing), out, looking, memory)
     remove_others([task.out for task in plan.tasks if isinstance(task, FactorsTask)])
     outcomes = execute(plan.tasks, client, watch)
     failures = {o.key: o.reason for o in outcomes if not o.ok and o.stage == "factors"}
@@ -81,33 +80,33 @@ def factors_along(
 
 def plan_factors(
     store: TileStore,
-    routes: Sequence[Route],
+    samples: Mapping[TileKey, Samples],
     out: str | os.PathLike[str],
-    spacing: float,
     looking: Looking,
     memory: int,
     have: Mapping[TileKey, str] | None = None,
 ) -> Plan:
-    """What `factors_along` will run; arguments and errors as there.
+    """What `factors_along` will run; other arguments and errors as there.
 
-    `have` is the identity of the points of each tile of the map; None: as the store has them.
+    Args:
+        store: the map.
+        samples: the sample points by tile (`samples_by_tile`).
+        out: folder of the tables.
+        looking: what the factors are made with.
+        memory: what a task may use [bytes].
+        have: the identity of the points of each tile of the map; None: as the store has them.
     """
-    names = tuple(route.route_id for route in routes)
-    if not names or len(set(names)) < len(names):
-        raise UsageError(
-            f"routes are named {', '.join(names) or 'nothing'}: give each its own name"
-        )
     cell_mm = whole_mm(looking.cell_size, "cell_size")
     store.grid.require_cell_size(cell_mm)
     have = store.identities() if have is None else have
+    map_state = hash_of(list(have.values()))
     cells: dict[TileKey, Task] = {}
     terms: dict[TileKey, Task] = {}
     inputs: dict[TileKey, str] = {}
     tasks: list[Task] = []
-    for tile, rows in sorted(samples_by_tile(store, routes, spacing).items()):
-        places = np.array([row[4:6] for row in rows])
+    for tile, points in samples.items():
         reach = looking.sensor.range_max
-        seen = [k for k in store.grid.keys_over(box_around(places, reach)) if k in have]
+        seen = [k for k in store.grid.keys_over(box_around(points.places, reach)) if k in have]
         for key in seen:
             if key not in terms:
                 near = store.grid.keys_over(store.grid.core(key).grown(reach_mm(cell_mm)))
@@ -121,11 +120,10 @@ def plan_factors(
                 store.url,
                 tile,
                 looking,
-                names,
-                tuple(rows),
-                hash_of(list(have.values())),
+                points,
+                map_state,
                 f"{os.fspath(out)}/factors/{tile}.parquet",
-                hash_of(facts(looking), names, rows, [inputs[key] for key in seen]),
+                hash_of(facts(looking), *points.facts(), [inputs[key] for key in seen]),
                 tuple(terms[key].key for key in seen),
             )
         )

@@ -10,7 +10,7 @@ from tilestream.dataflow.tasks import perform
 from tilestream.errors import TileNotReadyError
 from tilestream.factors.catalogue import COLUMNS, Which
 from tilestream.factors.rows import PLACE_COLUMNS as PLACE_COLUMNS  # noqa: PLC0414 - for others
-from tilestream.factors.rows import STATUS_COLUMNS, Sample, sample_rows
+from tilestream.factors.rows import STATUS_COLUMNS, Samples, sample_rows
 from tilestream.factors.table import TermsCache, factors
 from tilestream.factors.terms import terms_inputs, terms_table, tile_terms
 from tilestream.sensors import Sensor
@@ -70,8 +70,7 @@ class FactorsTask:
     store_url: str
     tile: TileKey
     looking: Looking
-    route_ids: tuple[str, ...]
-    samples: tuple[Sample, ...]
+    samples: Samples
     """Its sample points."""
     map_state: str
     """Hash of the whole map: terms that a process holds are of this map only."""
@@ -120,7 +119,7 @@ def _factors(task: FactorsTask) -> int:
     if mark is not None and mark["identity"] == task.identity:
         return 0
     store, looking = open_store(task.store_url), task.looking
-    frame = sample_rows(task.samples, task.route_ids, store, looking.sensor_height)
+    frame = sample_rows(task.samples, store, looking.sensor_height)
     positions = frame[["x", "y", "z"]].to_numpy()
     cache = _cache(task.store_url, looking.cell_size, task.map_state)
     found = factors(store, positions, looking.sensor, looking.cell_size, looking.which, cache)

@@ -214,7 +214,7 @@ class Measuring:
         }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Sample:
     """A sample point of a drive: one scan of the log."""
 

@@ -36,6 +36,7 @@ from tilestream.dataflow.simulate import simulate
 from tilestream.dataflow.tasks import Outcome
 from tilestream.errors import SourceNotFoundError, StoreNotFoundError, UsageError
 from tilestream.factors import catalogue
+from tilestream.factors.rows import samples_by_tile
 from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.forest.dataset import features_of, made_with
 from tilestream.forest.evaluation import factor_sets
@@ -195,16 +196,14 @@ def plan_measure(
     """
     tables = f"{settings.out}/tables"
     looking = Looking(settings.looking_sensor, settings.cell_size, "all", settings.sensor_height)
-    planned = [
-        plan_factors(store, inputs.routes, tables, settings.spacing, looking, settings.memory, have)
-    ]
+    samples = samples_by_tile(store.grid, inputs.routes, settings.spacing)
+    planned = [plan_factors(store, samples, tables, looking, settings.memory, have)]
     if settings.observe is not None:
         planned.append(
             plan_observe(
                 store,
-                inputs.routes,
+                samples,
                 tables,
-                settings.spacing,
                 observing_of(settings, settings.observe),
                 settings.memory,
                 have,

@@ -1,10 +1,9 @@
 """The job that observes: routes in, observability and virtual drive of every sample point out."""
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from tilestream.config import RegistrationSettings
@@ -12,9 +11,9 @@ from tilestream.dataflow.localize_tasks import CellsTask, box_around
 from tilestream.dataflow.observe_tasks import ObserveTask, Observing, SurfelsTask
 from tilestream.dataflow.plan import DEFAULT_MEMORY, Plan, Task
 from tilestream.dataflow.run import Watch, execute
-from tilestream.errors import PartialError, UsageError
+from tilestream.errors import PartialError
 from tilestream.factors.observability import MARGIN
-from tilestream.factors.rows import samples_by_tile
+from tilestream.factors.rows import Samples, samples_by_tile
 from tilestream.factors.surfels import around_tile, surfels_inputs
 from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.records import Route
@@ -77,7 +76,7 @@ def observe_along(
         cell_size,
         sensor_height,
     )
-    plan = plan_observe(store, routes, out, spacing, observing, memory)
+    plan = plan_observe(store, samples_by_tile(store.grid, routes, spacing), out, observing, memory)
     tables = [task.out for task in plan.tasks if isinstance(task, ObserveTask)]
     remove_others(tables)
     outcomes = execute(plan.tasks, client, watch)
@@ -92,40 +91,32 @@ def observe_along(
 
 def plan_observe(
     store: TileStore,
-    routes: Sequence[Route],
+    samples: Mapping[TileKey, Samples],
     out: str | os.PathLike[str],
-    spacing: float,
     observing: Observing,
     memory: int,
     have: Mapping[TileKey, str] | None = None,
     group: str = "",
 ) -> Plan:
-    """What `observe_along` will run; arguments and errors as there.
+    """What `observe_along` will run; other arguments and errors as there.
 
     Args:
         store: the map.
-        routes: where.
+        samples: the sample points by tile (`samples_by_tile`).
         out: folder of the tables.
-        spacing: distance between sample points [m].
         observing: what is observed with.
         memory: what a task may use [bytes].
         have: the identity of the points of each tile of the map; None: as the store has them.
         group: as whose sensor, where one plan observes with several.
     """
-    names = tuple(route.route_id for route in routes)
-    if not names or len(set(names)) < len(names):
-        raise UsageError(
-            f"routes are named {', '.join(names) or 'nothing'}: give each its own name"
-        )
     cell_mm = whole_mm(observing.cell_size, "cell_size")
     store.grid.require_cell_size(cell_mm)
     have = store.identities() if have is None else have
     made: dict[str, Task] = {}
     inputs: dict[TileKey, str] = {}
     tasks: list[Task] = []
-    for tile, samples in sorted(samples_by_tile(store, routes, spacing).items()):
-        places = np.array([(sample.x, sample.y) for sample in samples])
-        box = box_around(places, observing.range_max + MARGIN)
+    for tile, points in samples.items():
+        box = box_around(points.places, observing.range_max + MARGIN)
         seen = [key for key in store.grid.keys_over(box) if key in have]
         needs: list[str] = []
         for key in seen:
@@ -142,10 +133,9 @@ def plan_observe(
                 store.url,
                 tile,
                 observing,
-                names,
-                tuple(samples),
+                points,
                 f"{os.fspath(out)}/observability/{tile}.parquet",
-                hash_of(observing.facts(), names, samples, state),
+                hash_of(observing.facts(), *points.facts(), state),
                 tuple(needs),
                 group,
             )

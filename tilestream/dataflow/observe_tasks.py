@@ -10,7 +10,7 @@ from tilestream.dataflow.plan import BASE_BYTES
 from tilestream.dataflow.tasks import perform
 from tilestream.errors import TileNotReadyError
 from tilestream.factors.observability import COLUMNS, observability
-from tilestream.factors.rows import PLACE_COLUMNS, STATUS_COLUMNS, Sample, sample_rows
+from tilestream.factors.rows import PLACE_COLUMNS, STATUS_COLUMNS, Samples, sample_rows
 from tilestream.factors.surfels import (
     surfel_columns,
     surfel_mm,
@@ -93,8 +93,7 @@ class ObserveTask:
     store_url: str
     tile: TileKey
     observing: Observing
-    route_ids: tuple[str, ...]
-    samples: tuple[Sample, ...]
+    samples: Samples
     """Its sample points."""
     out: str
     identity: str
@@ -143,7 +142,7 @@ def _observe(task: ObserveTask) -> int:
     if mark is not None and mark["identity"] == task.identity:
         return 0
     store, how = open_store(task.store_url), task.observing
-    frame = sample_rows(task.samples, task.route_ids, store, how.sensor_height)
+    frame = sample_rows(task.samples, store, how.sensor_height)
     found = observability(
         store,
         frame[["x", "y", "z"]].to_numpy(),

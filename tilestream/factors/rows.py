@@ -1,16 +1,19 @@
 """What every table of sample points begins and ends with: which place, and whether it is done."""
 
-from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
+from tilestream.errors import UsageError
 from tilestream.factors.sample_points import raised
 from tilestream.formats.routes import resample
-from tilestream.records import Column, Route
+from tilestream.records import Column, Float64, Int64, Route
 from tilestream.store import TileStore
-from tilestream.tiling import TileKey
+from tilestream.tiling import MM_PER_M, TileGrid, TileKey
 
 PLACE_COLUMNS = (
     Column("route_id", "place", "", "Name of the route.", "", dtype="str"),
@@ -27,56 +30,99 @@ STATUS_COLUMNS = (
 )
 
 
-class Sample(NamedTuple):
-    """A sample point of one of several routes, on the road."""
+ROW = np.dtype(
+    [
+        ("route", np.int32),  # its index in `route_ids`
+        ("sample", np.int32),  # its number on the route
+        ("arc_length", np.float64),  # of the route up to it [m]
+        ("heading", np.float64),  # direction of travel [rad, from the map's x axis]
+        ("x", np.float64),  # place on the road [m, map frame]
+        ("y", np.float64),
+        ("z", np.float64),  # height of the route [m, map frame]; NaN where it has none
+    ]
+)
 
-    route: int
-    """Number of its route."""
-    sample: int
-    """Its number on the route."""
-    arc_length: float
-    """Length of the route up to it [m]."""
-    heading: float
-    """Direction of travel [rad, from the map's x axis]."""
-    x: float
-    """Place on the road [m, map frame]."""
-    y: float
-    """Place on the road [m, map frame]."""
-    z: float
-    """Height of the route [m, map frame]; NaN where it has none."""
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """The sample points of one tile, on the road: 48 bytes each, so that a plan holds a city's."""
+
+    route_ids: tuple[str, ...]
+    """Names of the routes that they lie on."""
+    rows: NDArray[np.void]
+    """(k,) of type `ROW`, route by route and along each."""
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @property
+    def places(self) -> Float64:
+        """(k, 2) x and y [m, map frame]."""
+        return np.column_stack([self.rows["x"], self.rows["y"]])
+
+    def facts(self) -> list[Any]:
+        """All that it is, as JSON has it: a part of the identity of tables made from it."""
+        return [self.route_ids, self.rows.tolist()]
 
 
 def samples_by_tile(
-    store: TileStore, routes: Iterable[Route], spacing: float
-) -> dict[TileKey, list[Sample]]:
-    """The sample points of all routes by the tile that holds them.
+    grid: TileGrid, routes: Sequence[Route], spacing: float
+) -> dict[TileKey, Samples]:
+    """The sample points of all routes by the tile that holds them, sorted by tile.
 
     Args:
-        store: the map.
-        routes: where.
+        grid: the tiles.
+        routes: where; each with a name of its own.
         spacing: arc length between sample points [m].
 
     Raises:
-        UsageError: as `resample`.
+        UsageError: no routes, two of one name, a place that is not finite; as `resample`.
     """
-    found: dict[TileKey, list[Sample]] = {}
-    for number, route in enumerate(routes):
-        points = resample(route, spacing)
-        columns = np.column_stack([points.arc_length, points.heading, points.positions])
-        for sample, row in enumerate(columns.tolist()):
-            key = store.grid.key_at(row[2], row[3])
-            found.setdefault(key, []).append(Sample(number, sample, *row))
-    return found
+    names = [route.route_id for route in routes]
+    if not names or len(set(names)) < len(names):
+        raise UsageError(
+            f"routes are named {', '.join(names) or 'nothing'}: give each its own name"
+        )
+    pieces: dict[TileKey, list[tuple[str, NDArray[np.void]]]] = {}
+    for route in routes:
+        rows = _rows_of(resample(route, spacing))
+        keys = _keys_of(grid, rows, route.route_id)
+        turns = np.flatnonzero((keys[1:] != keys[:-1]).any(axis=1)) + 1
+        for key, piece in zip(keys[[0, *turns]].tolist(), np.split(rows, turns), strict=True):
+            pieces.setdefault(TileKey(*key), []).append((route.route_id, piece))
+    return {key: _samples_of(pieces.pop(key)) for key in sorted(pieces)}
 
 
-def sample_rows(
-    samples: Sequence[Sample], route_ids: Sequence[str], store: TileStore, sensor_height: float
-) -> pd.DataFrame:
+def _rows_of(points: Route) -> NDArray[np.void]:
+    rows = np.zeros(len(points.arc_length), ROW)
+    rows["sample"] = np.arange(len(rows))
+    rows["arc_length"], rows["heading"] = points.arc_length, points.heading
+    rows["x"], rows["y"], rows["z"] = points.positions.T
+    return rows
+
+
+def _keys_of(grid: TileGrid, rows: NDArray[np.void], route_id: str) -> Int64:
+    """(k, 2) the tiles of sample points: `TileGrid.key_at` of each."""
+    mm = np.rint(np.column_stack([rows["x"], rows["y"]]) * MM_PER_M)
+    if not np.isfinite(mm).all():
+        raise UsageError(f"route {route_id} has a place that is not finite: give metres")
+    keys: Int64 = mm.astype(np.int64) // grid.tile_mm
+    return keys
+
+
+def _samples_of(pieces: Sequence[tuple[str, NDArray[np.void]]]) -> Samples:
+    """The pieces of routes that lie in one tile."""
+    number = {name: index for index, name in enumerate(dict.fromkeys(name for name, _ in pieces))}
+    rows = np.concatenate([piece for _, piece in pieces])
+    rows["route"] = np.repeat([number[n] for n, _ in pieces], [len(p) for _, p in pieces])
+    return Samples(tuple(number), rows)
+
+
+def sample_rows(samples: Samples, store: TileStore, sensor_height: float) -> pd.DataFrame:
     """Sample points as rows of `PLACE_COLUMNS`, raised to the lidar.
 
     Args:
         samples: on the road.
-        route_ids: names of their routes.
         store: the map, which tells the ground where a route has no z.
         sensor_height: height of the lidar above the road [m].
 
@@ -84,7 +130,8 @@ def sample_rows(
         UsageError: a height that is not finite.
         TileNotReadyError: a tile under the sample points failed or was skipped.
     """
-    frame = pd.DataFrame(samples, columns=Sample._fields)
-    frame["route_id"] = [route_ids[number] for number in frame.pop("route")]
+    frame = pd.DataFrame.from_records(samples.rows)
+    frame["route_id"] = [samples.route_ids[number] for number in frame.pop("route")]
     frame["z"] = raised(frame[["x", "y", "z"]].to_numpy(), store, sensor_height)[:, 2]
-    return frame[[column.name for column in PLACE_COLUMNS]]
+    types = {column.name: column.dtype for column in PLACE_COLUMNS}
+    return frame[list(types)].astype(types)
