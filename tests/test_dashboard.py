@@ -208,7 +208,7 @@ def city(n: int, notes: Path, seconds: float) -> list[Nap]:
 
 
 def get_json(url: str) -> dict[str, Any]:
-    with urllib.request.urlopen(url) as answer:
+    with urllib.request.urlopen(url, timeout=60.0) as answer:
         assert answer.headers["Content-Type"] == "application/json"
         return dict(json.loads(answer.read()))
 

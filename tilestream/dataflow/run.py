@@ -330,13 +330,23 @@ class _Workers:
         """Wait until no worker is busy with a task of a run whose client is gone.
 
         It cannot be stopped, and would write the same tile as this run does.
+
+        Raises:
+            TaskError: the scheduler is lost, or a worker has not answered for the patience.
         """
         said = False
         while True:
             self.require_scheduler()
             try:
-                found = self._client.run(_orphans, on_error="ignore")
-            except (OSError, TimeoutError, CommClosedError):
+                found = self._client.run(
+                    _orphans, on_error="ignore", callback_timeout=self._patience
+                )
+            except TimeoutError:
+                raise TaskError(
+                    f"a worker of the scheduler at {self._address} has not answered for "
+                    f"{self._patience:.0f} s: restart it, then run the same command again"
+                ) from None
+            except (OSError, CommClosedError):
                 raise self._lost() from None
             left = sorted(key for keys in found.values() for key in keys)
             if not left:
