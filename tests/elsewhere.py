@@ -8,18 +8,31 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from tilestream.dataflow.run import ONE_THREAD
+import distributed
+
+from tilestream.dataflow.run import ONE_THREAD, TlsFiles
+
+
+def certificates(folder: Path) -> TlsFiles:
+    """Certificates of an authority of a test's own, as files."""
+    made = distributed.Security.temporary()
+    texts = {"ca": made.tls_ca_file, "cert": made.tls_scheduler_cert, "key": made.tls_scheduler_key}
+    for name, text in texts.items():
+        (folder / f"{name}.pem").write_text(text)
+    return TlsFiles(*(str(folder / f"{name}.pem") for name in texts))
 
 
 @contextmanager
 def scheduler_elsewhere(
-    workers: int, *flags: str
+    workers: int, tls: TlsFiles | None = None
 ) -> Iterator[tuple[str, list["subprocess.Popen[bytes]"]]]:
     """Address and processes of a scheduler in another process, and of its workers."""
+    flags = [] if tls is None else ["--tls-ca-file", tls.ca, "--tls-cert", tls.cert]
+    flags += [] if tls is None else ["--tls-key", tls.key]
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    protocol = "tls" if flags else "tcp"
+    protocol = "tcp" if tls is None else "tls"
     address = f"{protocol}://127.0.0.1:{port}"
     common = ["--host", "127.0.0.1", *flags]
     program = [sys.executable, "-m", "distributed.cli.dask_scheduler"]

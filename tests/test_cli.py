@@ -10,6 +10,7 @@ import logs
 import numpy as np
 import pytest
 import zarr
+from elsewhere import certificates, scheduler_elsewhere
 from logs import START, pose
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
@@ -17,7 +18,9 @@ from scenes import PLACES, in_map
 from scipy.spatial.transform import Rotation
 
 import tilestream as ts
-from tilestream.cli.commands import parse_bytes, run
+from tilestream.cli import run
+from tilestream.cli.options import parse_bytes
+from tilestream.dataflow.run import TlsFiles
 from tilestream.errors import UsageError
 from tilestream.formats.las import write_las
 from tilestream.formats.mcap import open_log
@@ -89,6 +92,8 @@ def test_help_names_every_command(capsys: Told) -> None:
         assert command in shown
         assert run([command, "--help"]) == 0
         assert "Usage" in capsys.readouterr().out
+    assert run(["ingest", "--help"]) == 0
+    assert "Edge of a tile [m]." in capsys.readouterr().out
 
 
 def test_version_is_that_of_the_package(capsys: Told) -> None:
@@ -108,6 +113,7 @@ def test_version_is_that_of_the_package(capsys: Told) -> None:
         ["localize", "map.zarr", "drive.mcap", "--out", "run", "--matcher", "magic"],
         ["status"],
         ["info", "a.pcd", "--colour"],
+        ["ingest", "a.pcd", "--store", "m.zarr", "--workers", "2", "--tls-ca", "no.pem"],
     ],
 )
 def test_a_line_that_is_no_command_exits_with_2(
@@ -139,6 +145,54 @@ def test_amounts_of_memory() -> None:
             parse_bytes(wrong)
 
 
+# --- Where the tasks run
+
+
+def tls_options(tls: TlsFiles) -> list[str]:
+    return ["--tls-ca", tls.ca, "--tls-cert", tls.cert, "--tls-key", tls.key]
+
+
+def test_a_scheduler_elsewhere_is_reached_over_tls(
+    pcd: Path, store: str, tmp_path: Path, capsys: Told
+) -> None:
+    tls, url = certificates(tmp_path), str(tmp_path / "map.zarr")
+    command = ["ingest", str(pcd), "--store", url, "--tile-size", "20"]
+    with scheduler_elsewhere(1, tls) as (address, _):
+        assert run([*command, "--scheduler", address]) == 2
+        assert "perhaps check your TLS configuration" in capsys.readouterr().err
+        assert not Path(url).exists()
+        assert run([*command, "--scheduler", address, *tls_options(tls)]) == 0
+    assert ts.open_store(url).marks() == ts.open_store(store).marks()
+
+
+def test_a_cluster_of_our_own_listens_where_it_is_told_to(
+    pcd: Path, tmp_path: Path, capsys: Told, caplog: pytest.LogCaptureFixture
+) -> None:
+    tls, url = certificates(tmp_path), str(tmp_path / "map.zarr")
+    where = ["--workers", "2", "--host", "127.0.0.2", *tls_options(tls)]
+    assert run(["ingest", str(pcd), "--store", url, *where]) == 0
+    assert "listen on 127.0.0.2" in caplog.text
+    assert "only certificates let them act" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        (["--tls-ca"], "belong together"),
+        (["--tls-ca", "--tls-cert", "--tls-key"], "nobody listens"),
+        (["--host", "0.0.0.0"], "nobody listens"),
+        (["--host", "0.0.0.0", "--scheduler", "tcp://127.0.0.1:1"], "leave out --scheduler"),
+    ],
+)
+def test_options_that_would_say_nothing_are_refused(
+    options: list[str], reason: str, pcd: Path, tmp_path: Path, capsys: Told
+) -> None:
+    told = [part for o in options for part in ([o, str(pcd)] if "tls" in o else [o])]
+    assert run(["ingest", str(pcd), "--store", str(tmp_path / "map.zarr"), *told]) == 2
+    assert reason in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 # --- ingest
 
 
@@ -154,6 +208,7 @@ def test_ingest_makes_a_map_and_prints_its_tiles(
     for key in store.keys():
         assert f" {key} " in shown
         assert f" {len(store.tile(key).points()):,} " in shown
+    assert "lowest [m]" in shown
     assert run(["ingest", str(pcd), "--store", url, "--tile-size", "20", "--map-leaf", "0"]) == 0
 
 

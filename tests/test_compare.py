@@ -15,7 +15,7 @@ from report_json import charts, source
 from scenes import PLACES
 
 import tilestream as ts
-from tilestream.cli.commands import run
+from tilestream.cli import run
 from tilestream.dataflow.compare import Choice, choices_of, compare, plan_compare
 from tilestream.dataflow.observe_route import observe_along
 from tilestream.dataflow.plan import DEFAULT_MEMORY

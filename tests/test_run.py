@@ -15,13 +15,13 @@ import dask
 import distributed
 import psutil
 import pytest
-from elsewhere import scheduler_elsewhere
+from elsewhere import certificates, scheduler_elsewhere
 from hypothesis import given
 from hypothesis import strategies as st
 from naps import Nap
 
 from tilestream.dataflow.plan import Plan
-from tilestream.dataflow.run import TlsFiles, dask_client, execute, report_kept
+from tilestream.dataflow.run import dask_client, execute, report_kept
 from tilestream.dataflow.tasks import Outcome, perform
 from tilestream.errors import PlanError, TaskError, TilestreamError, UsageError
 from tilestream.tiling import TileKey
@@ -332,19 +332,18 @@ with dask_client(sys.argv[1], None, 1) as client:
 
 
 def test_certificates_are_passed_through(tmp_path: Path) -> None:
-    made = distributed.Security.temporary()
-    paths = {name: tmp_path / f"{name}.pem" for name in ("ca", "cert", "key")}
-    paths["ca"].write_text(made.tls_ca_file)
-    paths["cert"].write_text(made.tls_scheduler_cert)
-    paths["key"].write_text(made.tls_scheduler_key)
-    ca, cert, key = (str(path) for path in paths.values())
-    flags = ("--tls-ca-file", ca, "--tls-cert", cert, "--tls-key", key)
-    with scheduler_elsewhere(1, *flags) as (address, _):
-        with dask_client(address, None, 1, tls=TlsFiles(ca, cert, key)) as client:
+    tls = certificates(tmp_path)
+    with scheduler_elsewhere(1, tls) as (address, _):
+        with dask_client(address, None, 1, tls=tls) as client:
             assert execute([Nap(TileKey(0, 0))], client, None)[0].result == "0_0"
         with (
             pytest.raises(UsageError, match=r"perhaps check your TLS configuration"),
             dask_client(address, None, 1),
+        ):
+            pass
+        with (
+            pytest.raises(UsageError, match=r"is no scheduler that can be asked: .*ncryption"),
+            dask_client(address.replace("tls", "tcp"), None, 1, tls=tls),
         ):
             pass
 

@@ -1,4 +1,4 @@
-"""The command line: `commands` parse, call and print; the only room that exits."""
+"""The command line: `app` lists the commands, each group of them has a file."""
 
-from tilestream.cli.commands import main as main
-from tilestream.cli.commands import run as run
+from tilestream.cli.app import main as main
+from tilestream.cli.app import run as run

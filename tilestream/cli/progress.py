@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import rich.progress
-from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -17,10 +16,9 @@ from rich.progress import (
 )
 from rich.text import Text
 
+from tilestream.cli.printing import err
 from tilestream.dataflow.run import Watch
 from tilestream.dataflow.tasks import Outcome
-
-err = Console(stderr=True)
 
 
 class Rate(ProgressColumn):
@@ -50,8 +48,8 @@ def progress() -> Iterator[Watch]:
                 rows[outcome.stage] = bar.add_task(outcome.stage, total=total)
             bar.update(rows[outcome.stage], completed=ended, total=total)
             if not outcome.ok:
-                bar.console.print(f"[red]failed[/] {outcome.key}: ", end="")
+                bar.console.print("failed", style="red", end="")
                 told = outcome.details if "--debug" in sys.argv else outcome.reason
-                bar.console.print(told or outcome.reason, markup=False, highlight=False)
+                bar.console.print(f" {outcome.key}: {told or outcome.reason}", highlight=False)
 
         yield watch

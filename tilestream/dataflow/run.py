@@ -423,10 +423,11 @@ def dask_client(
             yield client
     elif count > 1:
         if host != LOOPBACK:
+            risk = "run code here; use TLS, or a network that you trust"
             logger.warning(
-                "scheduler and dashboard listen on %s: whoever reaches them can run code here; "
-                "use TLS, or a network that you trust",
+                "scheduler and dashboard listen on %s: whoever reaches them can %s",
                 host,
+                risk if tls is None else "watch the run, though only certificates let them act",
             )
         with (
             distributed.LocalCluster(
@@ -455,7 +456,8 @@ def _connected(scheduler: str, security: Any | None) -> Iterator[Any]:
         client = distributed.Client(scheduler, security=security)
     except (OSError, TimeoutError, CommClosedError) as error:
         raise TaskError(f"no Dask scheduler answers at {scheduler}: {error}") from error
-    except (ValueError, TypeError) as error:  # TypeError: of certificates that are missing
+    except (ValueError, TypeError, RuntimeError) as error:  # of an address without its
+        # certificates, or of certificates for an address that takes none
         raise UsageError(f"{scheduler!r} is no scheduler that can be asked: {error}") from error
     with client:
         yield client

@@ -1,0 +1,143 @@
+"""The commands of whole jobs: the main job, its plan, the simulation, the demo."""
+
+import json
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pandas as pd
+import typer
+
+from tilestream.cli.cluster import ALL_CORES, HERE, AllCores, Cluster, on_cluster
+from tilestream.cli.options import AsJson, Changes, Config, DryRun
+from tilestream.cli.printing import err, out, print_json, say
+from tilestream.cli.progress import progress
+from tilestream.cli.tables import forecast_rows, forecast_table, plan_table, report_table
+from tilestream.dataflow import main_job
+from tilestream.dataflow import simulate as simulation
+from tilestream.dataflow.main_plan import forecast
+from tilestream.dataflow.run_settings import RunSettings, read_settings
+from tilestream.dataflow.telling import page_url
+from tilestream.errors import LimitError
+from tilestream.report import exceeds
+from tilestream.simulation.settings import load_preset
+
+
+@on_cluster
+def run(
+    config: Config,
+    changes: Changes = [],  # noqa: B006 - typer's way to say none
+    fail_over: Annotated[
+        float | None, typer.Option(help="Exit with 1 if any estimate is above this [m].")
+    ] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="As `plan`.")] = False,
+    as_json: AsJson = False,
+    cluster: Cluster = ALL_CORES,
+) -> None:
+    """The main job: from map and drives to the estimated error everywhere, and its report."""
+    if dry_run:
+        plan(config, changes, as_json=as_json)
+        return
+    folder = do_job(read_settings(config, changes), cluster)
+    if as_json:
+        print_json(report_of(folder))
+    else:
+        show_report(folder)
+    if fail_over is not None:
+        judge_over(folder, fail_over)
+
+
+def do_job(settings: RunSettings, cluster: Cluster) -> Path:
+    """Run the main job with progress; the run directory."""
+    with cluster.client(settings.memory) as client, progress() as watch:
+        if client is not None:
+            say(f"Watch it at {page_url(client)}", to=err)
+        return main_job.run(settings, client, watch)
+
+
+def report_of(folder: Path) -> dict[str, Any]:
+    """The figures of a run's report."""
+    found: dict[str, Any] = json.loads((folder / "report" / "report.json").read_text())
+    return found
+
+
+def show_report(folder: Path) -> None:
+    """Print the headline of a report and where it is."""
+    out.print(report_table(report_of(folder)))
+    say(f"The report is at {(folder / 'report' / 'index.html').absolute()}")
+
+
+def judge_over(folder: Path, limit: float) -> None:
+    """Fail where the estimated error is too large: a gate for a map release.
+
+    Raises:
+        LimitError: an estimate is above the limit; says how many and the worst.
+    """
+    places = pd.read_csv(folder / "report" / "places.csv")
+    if exceeds(places, limit):
+        over = places[places["estimate"] > limit].nlargest(1, "estimate")
+        count = int((places["estimate"] > limit).sum())
+        where = [
+            f"{r.estimate:.2f} m on {r.route_id} at {r.arc_length:.0f} m" for r in over.itertuples()
+        ]
+        raise LimitError(
+            f"{count} of {len(places)} sample points are estimated above {limit:g} m, the worst "
+            f"{''.join(where)}"
+        )
+
+
+def plan(
+    config: Config,
+    changes: Changes = [],  # noqa: B006
+    as_json: AsJson = False,
+) -> None:
+    """What a job would run: stages, tasks, memory, core-hours; reads headers, writes nothing."""
+    expected = forecast(read_settings(config, changes))
+    rows = forecast_rows(expected)
+    if as_json:
+        print_json({"stages": rows, "notes": list(expected.notes)})
+        return
+    out.print(forecast_table(rows))
+    for note in expected.notes:
+        say(note)
+
+
+@on_cluster
+def simulate(
+    city: Annotated[Literal["shinjuku"], typer.Argument(help="The city that ships with us.")],
+    folder: Annotated[str, typer.Option("--out", help="Folder of map, logs and routes.")],
+    preset: Annotated[
+        str, typer.Option(help="physical, paper, or your own YAML file.")
+    ] = "physical",
+    paths: Annotated[str | None, typer.Option(help="Only these, e.g. I,III; default: all.")] = None,
+    scans_per_point: Annotated[int, typer.Option(help="Turns of the lidar per metre.")] = 1,
+    seed: Annotated[int, typer.Option(help="Seed of everything.")] = 0,
+    drive: Annotated[int, typer.Option(min=0, help="Another day: other traffic and noise.")] = 0,
+    size: Annotated[Literal["full", "small"], typer.Option(help="small: 40 m per path.")] = "full",
+    dry_run: DryRun = False,
+    cluster: Cluster = HERE,
+) -> None:
+    """Simulate a survey of Shinjuku and drives through it; a killed run continues."""
+    settings = load_preset(preset).model_copy(update={"seed": seed, "drive": drive})
+    what: dict[str, Any] = {
+        "paths": paths.split(",") if paths else None,
+        "scans_per_point": scans_per_point,
+        "size": size,
+    }
+    if dry_run:
+        out.print(plan_table(simulation.plan_simulation(settings, folder, **what)))
+        return
+    with cluster.client(simulation.SCENE_BYTES) as client, progress() as watch:
+        made = simulation.simulate(settings, folder, **what, client=client, watch=watch)
+    say(f"{city}, preset {settings.preset}: {settings.note}")
+    say(f"The map is in {made}/survey, the drives are in {made}/logs")
+
+
+def demo(
+    folder: Annotated[str, typer.Option("--out", help="The run directory.")] = "tilestream-demo",
+    workers: AllCores = None,
+) -> None:
+    """The main job on a few streets of Shinjuku, simulated first: some minutes, no files needed."""
+    with resources.as_file(resources.files("tilestream") / "data" / "demo.yaml") as path:
+        settings = read_settings(path, [f"out={json.dumps(folder)}"])
+    show_report(do_job(settings, Cluster(workers=workers)))

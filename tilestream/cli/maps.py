@@ -1,0 +1,148 @@
+"""The commands about maps and files: make a tile store, look into one, compare two."""
+
+from dataclasses import asdict
+from typing import Annotated
+
+import typer
+
+from tilestream.cli.cluster import HERE, Cluster, on_cluster
+from tilestream.cli.options import (
+    AsJson,
+    DryRun,
+    Every,
+    FromS,
+    Memory,
+    Offset,
+    PointsTopic,
+    PoseTopic,
+    StoreUrl,
+    UntilS,
+    parse_bytes,
+)
+from tilestream.cli.printing import out, print_json, say
+from tilestream.cli.progress import progress
+from tilestream.cli.tables import TILE_CHANGES, diff_table, info_table, plan_table, tile_table
+from tilestream.config import IngestSettings
+from tilestream.dataflow import ingest_map, map_diff
+from tilestream.errors import PartialError
+from tilestream.formats import describe
+from tilestream.formats.mcap import ScanSelection
+from tilestream.store import POINTS, TileStore, open_store
+
+
+@on_cluster
+def ingest(
+    sources: Annotated[
+        list[str], typer.Argument(help="Files, globs, Autoware map directories, mixed.")
+    ],
+    store: Annotated[str, typer.Option(help="The tile store: a path or an fsspec URL.")],
+    tile_size: Annotated[float, typer.Option(help="Edge of a tile [m].")] = 100.0,
+    halo: Annotated[float, typer.Option(help="What tasks read around a tile [m].")] = 10.0,
+    map_leaf: Annotated[
+        float, typer.Option(help="Thin to one point per voxel [m]; 0: keep.")
+    ] = 0.2,
+    crs: Annotated[str | None, typer.Option(help="CRS of the map, e.g. EPSG:6677.")] = None,
+    points_topic: PointsTopic = None,
+    pose_topic: PoseTopic = None,
+    every: Every = 1,
+    offset: Offset = 0,
+    from_s: FromS = 0.0,
+    until_s: UntilS = None,
+    memory: Memory = "1GB",
+    dry_run: DryRun = False,
+    cluster: Cluster = HERE,
+) -> None:
+    """Make a tile store from point clouds, map directories and logs of drives."""
+    settings = IngestSettings(tile_size=tile_size, halo=halo, map_leaf=map_leaf, crs=crs)
+    allowed = parse_bytes(memory)
+    scans = ScanSelection(every=every, offset=offset, from_s=from_s, until_s=until_s)
+    if dry_run:
+        plan = ingest_map.plan_ingest(
+            sources, store, settings, allowed, points_topic, pose_topic, scans
+        )
+        out.print(plan_table(plan))
+        return
+    failed: PartialError | None = None
+    with cluster.client(allowed) as client, progress() as watch:
+        try:
+            ingest_map.ingest(
+                sources,
+                store,
+                **settings.model_dump(),
+                client=client,
+                memory=allowed,
+                watch=watch,
+                points_topic=points_topic,
+                pose_topic=pose_topic,
+                scans=scans,
+            )
+        except PartialError as error:
+            failed = error
+    made = open_store(store)
+    print_sources(made)
+    out.print(tile_table(made))
+    if failed is not None:
+        raise failed
+
+
+def status(
+    store: StoreUrl,
+    as_json: AsJson = False,
+) -> None:
+    """Show the tiles of a store: counts, extents, status and reasons."""
+    opened = open_store(store)
+    marks = opened.marks(POINTS)
+    failures = {f"tile {k}": m.reason for k, m in marks.items() if m.status == "failed"}
+    failures |= {s["path"]: s["reason"] for s in opened.sources() if s["reason"]}
+    if as_json:
+        print_json(
+            {
+                "url": opened.url,
+                "settings": asdict(opened.settings),
+                "sources": opened.sources(),
+                "tiles": {str(key): asdict(mark) for key, mark in marks.items()},
+            }
+        )
+    else:
+        out.print(tile_table(opened))
+    if failures:
+        raise PartialError(f"{store}: {len(failures)} sources or tiles failed:", failures)
+
+
+def info(
+    file: Annotated[str, typer.Argument(help="Any supported file, log or map directory.")],
+    as_json: AsJson = False,
+) -> None:
+    """Show what is in a file or log: points, bounds, fields, topics, CRS."""
+    found = describe(file)
+    if as_json:
+        print_json(asdict(found))
+    else:
+        out.print(info_table(found))
+
+
+def diff(
+    old: Annotated[str, typer.Argument(help="A run directory or tile store.")],
+    new: Annotated[str, typer.Argument(help="The newer one.")],
+    worse: Annotated[
+        float, typer.Option(help="List estimates that grew by more [m].")
+    ] = map_diff.WORSE,
+    as_json: AsJson = False,
+) -> None:
+    """What a map update changes: tiles, and sample points whose estimate got worse."""
+    found = map_diff.diff(old, new, worse=worse)
+    if as_json:
+        tiles = {kind: [str(k) for k in getattr(found, kind)] for kind in TILE_CHANGES}
+        points = found.worse.to_dict("records")
+        print_json({**tiles, "same": found.same, "compared": found.compared, "worse": points})
+    else:
+        out.print(diff_table(found))
+
+
+def print_sources(store: TileStore) -> None:
+    """What an ingest read, a line per source."""
+    for source in store.sources():
+        dropped = f", {source['dropped']:,} not finite and dropped" if source["dropped"] else ""
+        say(f"{source['path']}: {source['format']}, {source['points']:,} points{dropped}")
+        for note in source["notes"]:
+            say(f"  {note}")
