@@ -58,9 +58,11 @@ def moved_las(file: bytes, dx: float, dy: float) -> bytes:
 
 def routes(n: int, size: float) -> list[ts.Route]:
     """Down every street of the city."""
-    ends = [[(1.0, (row + 0.5) * size, np.nan), (n * size - 1.0, (row + 0.5) * size, np.nan)]
-            for row in range(n)]  # fmt: skip
-    return [route_of(f"street {row}", np.array(line)) for row, line in enumerate(ends)]
+    x = np.linspace(1.0, n * size - 1.0, n + 1)
+    return [
+        route_of(f"street {row}", np.stack([x, np.full_like(x, (row + 0.5) * size), x * np.nan], 1))
+        for row in range(n)
+    ]
 
 
 def write_drive(path: Path, size: float, spacing: float) -> Path:
