@@ -17,6 +17,7 @@ from streets import SCANS, STREETS, job
 
 import tilestream as ts
 from tilestream.cli import run as command
+from tilestream.cli.tables import forecast_rows
 from tilestream.dataflow import estimate_tasks, main_job
 from tilestream.dataflow.calibration import calibration_file, core_hours, learn
 from tilestream.dataflow.main_plan import forecast
@@ -27,6 +28,7 @@ from tilestream.errors import ModelError, PartialError, SourceNotFoundError, Usa
 from tilestream.forest import evaluation, models, training
 from tilestream.forest.models import Recipe
 from tilestream.forest.training import PREDICTION_COLUMNS
+from tilestream.simulation.settings import load_preset
 
 
 class Told:
@@ -435,6 +437,21 @@ def test_a_plan_before_anything_is_there_reads_headers_only(inputs: Path, tmp_pa
     assert {"scatter", "cells", "terms", "factors", "register"} <= {t.stage for t in expected.tasks}
     assert not (tmp_path / "run").exists()
     assert any("bounds" in note or "where the points" in note for note in expected.notes)
+
+
+def test_a_city_that_is_not_simulated_yet_is_planned_first(tmp_path: Path) -> None:
+    small = {"paths": ("III",), "size": "small", "drives": 2, "preset": "paper"}
+    settings = RunSettings(out=str(tmp_path / "run"), simulate=small)
+    stages = {row["stage"]: row for row in forecast_rows(forecast(settings))}
+    one_survey = load_preset("paper").survey.passes * 40
+    assert {name: row["work"] for name, row in stages.items()} == {
+        "survey": one_survey,
+        "scan": 2 * 40,
+        "log": 2 * 40,
+    }
+    assert stages["log"]["after"] == ["scan"]
+    assert all(float(row["core_hours"]) > 0.0 for row in stages.values())
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_job_that_does_not_fit_is_refused_before_it_runs(

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -409,12 +410,15 @@ def test_readers_take_the_true_poses_and_not_the_odometry(made: Path, city: City
 
 
 def test_the_command_makes_what_is_ingested_and_localized(
-    settings: SimulationSettings, tmp_path: Path
+    settings: SimulationSettings, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     preset = tmp_path / "tiny.yaml"
     preset.write_text(yaml.safe_dump(settings.model_dump(mode="json")))
     out = tmp_path / "sim"
     command = ["simulate", "shinjuku", "--preset", str(preset), "--out", str(out)]
+    assert run([*command, "--size", "small", "--dry-run"]) == 0
+    assert re.search(r"survey\s+4 .*scan\s+1 .*log\s+1 ", capsys.readouterr().out, re.DOTALL)
+    assert not out.exists()
     assert run([*command, "--size", "small"]) == 0
     store = ts.ingest(str(out / "survey" / "*.laz"), tmp_path / "map.zarr")
     table = ts.localize(

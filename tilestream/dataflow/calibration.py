@@ -9,6 +9,9 @@ from tilestream.dataflow.plan import Task
 from tilestream.dataflow.tasks import Outcome
 
 SECONDS_PER_WORK: Mapping[str, float] = {
+    "survey": 0.07,
+    "scan": 0.03,
+    "log": 0.02,
     "scatter": 5.5e-8,
     "merge": 0.1,
     "cells": 0.12,

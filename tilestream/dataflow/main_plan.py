@@ -31,8 +31,8 @@ from tilestream.dataflow.observe_route import plan_observe
 from tilestream.dataflow.observe_tasks import ObserveTask, Observing
 from tilestream.dataflow.plan import Plan, Task
 from tilestream.dataflow.run import Watch
-from tilestream.dataflow.run_settings import DriveSettings, RunSettings
-from tilestream.dataflow.simulate import simulate
+from tilestream.dataflow.run_settings import DriveSettings, RunSettings, SimulateSettings
+from tilestream.dataflow.simulate import Stretch, plan_simulation, simulate
 from tilestream.dataflow.tasks import Outcome
 from tilestream.errors import SourceNotFoundError, StoreNotFoundError, UsageError
 from tilestream.factors import catalogue
@@ -45,7 +45,7 @@ from tilestream.formats import describe
 from tilestream.formats.mcap import ScanSelection
 from tilestream.formats.routes import read_routes
 from tilestream.records import Route
-from tilestream.simulation.settings import load_preset
+from tilestream.simulation.settings import SimulationSettings, load_preset
 from tilestream.store import StoreSettings, TileStore, hash_of, open_store
 from tilestream.tiling import MM_PER_M, Box, TileKey
 from tilestream.version import VERSION
@@ -84,23 +84,15 @@ def inputs_of(settings: RunSettings, client: Any | None, watch: Watch | None) ->
         return Inputs(settings.map.sources, drives, _routes(files, settings))
     folder = simulated_folder(settings)
     wanted = settings.simulate
-    preset = load_preset(wanted.preset).model_copy(update={"seed": wanted.seed})
-    for drive in range(wanted.drives):
-        simulate(
-            preset.model_copy(update={"drive": drive}),
-            folder,
-            paths=wanted.paths,
-            scans_per_point=wanted.scans_per_point,
-            size=wanted.size,
-            client=client,
-            watch=watch,
-        )
+    for drive in _simulations(wanted):
+        simulate(drive, folder, **_extent(wanted), client=client, watch=watch)
     logs = [
         DriveSettings(log=str(log), name=f"drive{drive}-{log.stem}")
         for drive in range(wanted.drives)
         for log in sorted((folder / "logs" / f"drive{drive}").glob("*.mcap"))
         if wanted.paths is None or log.stem in wanted.paths
     ]
+    preset = load_preset(wanted.preset)
     routes = _routes(settings.routes or (str(folder / "routes.geojson"),), settings)
     if wanted.paths is not None and not settings.routes:
         routes = tuple(route for route in routes if route.route_id in wanted.paths)
@@ -111,6 +103,21 @@ def inputs_of(settings: RunSettings, client: Any | None, watch: Watch | None) ->
         notes=(f"Simulated, preset {preset.preset}: {preset.note}",),
         attributions=(ATTRIBUTION,),
     )
+
+
+def _simulations(wanted: SimulateSettings) -> list[SimulationSettings]:
+    """The experiment of each drive."""
+    preset = load_preset(wanted.preset).model_copy(update={"seed": wanted.seed})
+    return [preset.model_copy(update={"drive": drive}) for drive in range(wanted.drives)]
+
+
+def _extent(wanted: SimulateSettings) -> dict[str, Any]:
+    """How much of the city is simulated, as `simulate` and its plan take it."""
+    return {
+        "paths": wanted.paths,
+        "scans_per_point": wanted.scans_per_point,
+        "size": wanted.size,
+    }
 
 
 ATTRIBUTION = (
@@ -379,7 +386,8 @@ class Forecast:
     """What a job would do, told before it does anything."""
 
     tasks: tuple[Task, ...]
-    """The tasks, each after those that it needs; of the map's tiles, those that there may be."""
+    """The tasks, each after those that it needs; of the map's tiles, those that there may be; of a
+    city that is not simulated yet, those that make it."""
     notes: tuple[str, ...]
     """What is not known before the job runs."""
 
@@ -392,15 +400,27 @@ def forecast(settings: RunSettings) -> Forecast:
         UsageError, SourceError, StoreError: as the job itself.
     """
     if settings.simulate is not None and not is_simulated(settings):
-        return Forecast(
-            (), (f"first the city is simulated in {simulated_folder(settings)}; then plan again",)
-        )
+        return _simulation_first(settings, settings.simulate)
     inputs = inputs_of(settings, None, None)
     store, reading, have, notes = _expected_map(settings, inputs)
     measure = plan_measure(settings, inputs, store, (), have)
     done = [Outcome(task.key, task.stage, None) for task in measure.tasks]
     estimate = plan_estimate(settings, measure, done)
     return Forecast((*reading, *measure.tasks, *estimate.tasks), tuple(notes))
+
+
+def _simulation_first(settings: RunSettings, wanted: SimulateSettings) -> Forecast:
+    """What simulates the city, as far as it is not there."""
+    folder = simulated_folder(settings)
+    plans = [plan_simulation(drive, folder, **_extent(wanted)) for drive in _simulations(wanted)]
+    missing = {
+        task.path: task
+        for plan in plans
+        for task in plan.tasks
+        if isinstance(task, Stretch) and not Path(task.path).exists()
+    }  # all drives have one survey
+    note = f"first the city is simulated in {folder}; plan again to see what follows"
+    return Forecast(tuple(missing.values()), (note,))
 
 
 def _expected_map(

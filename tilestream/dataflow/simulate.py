@@ -51,7 +51,7 @@ Size = Literal["full", "small"]
 
 
 @dataclass(frozen=True)
-class _Stretch:
+class Stretch:
     """A piece of a street that something is simulated along."""
 
     settings: str
@@ -73,7 +73,7 @@ class _Stretch:
 
 
 @dataclass(frozen=True)
-class SurveyTask(_Stretch):
+class SurveyTask(Stretch):
     """One pass of the mapping vehicle along a stretch: a block of LAZ."""
 
     passes: int = 0
@@ -86,7 +86,7 @@ class SurveyTask(_Stretch):
 
 
 @dataclass(frozen=True)
-class ScanTask(_Stretch):
+class ScanTask(Stretch):
     """The scans of a drive along a stretch, kept until the log is written."""
 
     scans_per_point: int = 1
@@ -99,7 +99,7 @@ class ScanTask(_Stretch):
 
 
 @dataclass(frozen=True)
-class LogTask(_Stretch):
+class LogTask(Stretch):
     """All scans of a drive along a street as one MCAP log."""
 
     parts: tuple[str, ...] = ()
@@ -313,7 +313,7 @@ def _require_same(folder: Path, identity: dict[str, Any]) -> None:
 
 def _begin(folder: Path, city: City, plan: Plan, identity: dict[str, Any]) -> None:
     """Make the folders; write what is simulated, and the routes."""
-    for part in {Path(task.path).parent for task in plan.tasks if isinstance(task, _Stretch)}:
+    for part in {Path(task.path).parent for task in plan.tasks if isinstance(task, Stretch)}:
         part.mkdir(parents=True, exist_ok=True)
     facts = identity | {
         "note": city.settings.note,
