@@ -27,7 +27,7 @@ import literal
 from streets import TILE, Floats, long_street, street_tile
 
 import tilestream as ts
-from tilestream.dataflow.factors_route import factors_along
+from tilestream.dataflow.along_routes import factors_along
 from tilestream.factors.catalogue import CRITERIA, columns_of
 from tilestream.factors.local_similarity import NEIGHBOUR_RADIUS
 from tilestream.factors.table import factors_at

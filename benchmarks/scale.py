@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from city_tiles import run_city, write_city
 from elsewhere import scheduler_elsewhere
 
-from tilestream.dataflow import factors_route, ingest_map
+from tilestream.dataflow import along_routes, ingest_map
 from tilestream.dataflow.plan import Task
 from tilestream.dataflow.run import dask_client, execute
 from tilestream.dataflow.tasks import Outcome
@@ -63,7 +63,7 @@ def run_client(folder: str, n: int, size: float, address: str) -> dict[str, Any]
         before = cpu_of(psutil.Process())
         print(json.dumps({"warm": True}), flush=True)
         input()  # the parent has looked at the other processes
-        ingest_map.execute = factors_route.execute = counted  # type: ignore[assignment]
+        ingest_map.execute = along_routes.execute = counted  # type: ignore[assignment]
         began = time.perf_counter()
         run_city(
             f"{folder}/city", f"{folder}/out", n, size, spacing=1.0, reach=REACH, client=client,

@@ -16,8 +16,8 @@ from scenes import PLACES
 
 import tilestream as ts
 from tilestream.cli import run
+from tilestream.dataflow.along_routes import observe_along
 from tilestream.dataflow.compare import Choice, choices_of, compare, plan_compare
-from tilestream.dataflow.observe_route import observe_along
 from tilestream.dataflow.plan import DEFAULT_MEMORY
 from tilestream.errors import UsageError
 from tilestream.factors.virtual_scan import VirtualSettings

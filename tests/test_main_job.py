@@ -20,7 +20,7 @@ from tilestream.cli import run as command
 from tilestream.cli.tables import forecast_rows
 from tilestream.dataflow import estimate_tasks, main_job
 from tilestream.dataflow.calibration import calibration_file, core_hours, learn
-from tilestream.dataflow.main_plan import forecast
+from tilestream.dataflow.main_forecast import forecast
 from tilestream.dataflow.run import dask_client
 from tilestream.dataflow.run_settings import RunSettings, read_settings
 from tilestream.dataflow.tasks import Outcome

@@ -11,7 +11,7 @@ import pytest
 from scenes import PLACES
 
 import tilestream as ts
-from tilestream.dataflow.observe_route import observe_along, plan_observe
+from tilestream.dataflow.along_routes import observe_along, plan_observe
 from tilestream.dataflow.observe_tasks import Observing
 from tilestream.dataflow.plan import DEFAULT_MEMORY
 from tilestream.errors import PlanError, UsageError

@@ -29,9 +29,9 @@ from tilestream.forest.models import COMPETITORS
 from tilestream.forest.protocols import PROTOCOLS
 from tilestream.report import Findings, write_report
 from tilestream.report.charts import path_chart
+from tilestream.report.evidence import MODELS, PAPER_IMPORTANCES, PROTOCOL_NAMES, table_iv
 from tilestream.report.judgement import worst_places
 from tilestream.report.page import CONTENTS
-from tilestream.report.sections import MODELS, PAPER_IMPORTANCES, PROTOCOL_NAMES, table_iv
 from tilestream.report.words import length, span
 
 TAGS = re.compile(r"<(script|style)[^>]*>.*?</\1>|<[^>]*>", re.DOTALL)

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 from tilestream.config import RegistrationSettings as RegistrationSettings
 from tilestream.config import StartSettings as StartSettings
-from tilestream.dataflow.factors_route import factors_along as factors_along
+from tilestream.dataflow.along_routes import factors_along as factors_along
+from tilestream.dataflow.along_routes import observe_along as observe_along
 from tilestream.dataflow.ingest_map import ingest as ingest
 from tilestream.dataflow.localize_drive import localize as localize
-from tilestream.dataflow.observe_route import observe_along as observe_along
 from tilestream.factors.observability import observability as observability
 from tilestream.factors.sample_points import sample_points as sample_points
 from tilestream.factors.table import factors as factors

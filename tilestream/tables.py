@@ -66,6 +66,12 @@ def read_mark(path: str) -> dict[str, Any] | None:
     return dict(json.loads(metadata[_MARK])) if _MARK in metadata else None
 
 
+def is_done(path: str, identity: str) -> bool:
+    """Whether a whole table is at `path` that was made from the same."""
+    mark = read_mark(path)
+    return mark is not None and mark["identity"] == identity
+
+
 def remove_others(keep: Sequence[str]) -> None:
     """Remove what lies beside these tables in their folder: of other settings, or half-written."""
     fs, place = fsspec.core.url_to_fs(keep[0])

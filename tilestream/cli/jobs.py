@@ -15,7 +15,7 @@ from tilestream.cli.progress import progress
 from tilestream.cli.tables import forecast_rows, forecast_table, plan_table, report_table
 from tilestream.dataflow import main_job
 from tilestream.dataflow import simulate as simulation
-from tilestream.dataflow.main_plan import forecast
+from tilestream.dataflow.main_forecast import forecast
 from tilestream.dataflow.run_settings import RunSettings, read_settings
 from tilestream.dataflow.telling import page_url
 from tilestream.errors import LimitError

@@ -39,8 +39,8 @@ from tilestream.cli.tables import (
     plan_table,
 )
 from tilestream.config import StartSettings
+from tilestream.dataflow import along_routes, localize_drive
 from tilestream.dataflow import compare as comparing
-from tilestream.dataflow import factors_route, localize_drive
 from tilestream.dataflow.factors_tasks import Looking
 from tilestream.dataflow.localize_tasks import Reading
 from tilestream.errors import PartialError
@@ -148,11 +148,11 @@ def factors(
     if dry_run:
         looking = Looking(seen_by, cell_size, which, sensor_height)
         samples = samples_by_tile(opened.grid, routes, spacing)
-        plan = factors_route.plan_factors(opened, samples, folder, looking, allowed)
+        plan = along_routes.plan_factors(opened, samples, folder, looking, allowed)
         out.print(plan_table(plan))
         return
     with cluster.client(allowed) as client, progress() as watch:
-        rows = factors_route.factors_along(
+        rows = along_routes.factors_along(
             opened,
             routes,
             folder,

@@ -8,7 +8,7 @@ from rich.box import SIMPLE
 from rich.table import Table
 
 from tilestream.dataflow.calibration import core_hours
-from tilestream.dataflow.main_plan import Forecast
+from tilestream.dataflow.main_forecast import Forecast
 from tilestream.dataflow.map_diff import MapDiff
 from tilestream.dataflow.plan import Plan, megabytes
 from tilestream.factors.catalogue import COLUMNS

@@ -14,13 +14,13 @@ from typing import Any
 import pandas as pd
 
 from tilestream.config import RegistrationSettings
+from tilestream.dataflow.along_routes import SENSOR_HEIGHT, plan_observe
 from tilestream.dataflow.localize_tasks import CellsTask
-from tilestream.dataflow.observe_route import SENSOR_HEIGHT, plan_observe
 from tilestream.dataflow.observe_tasks import ObserveTask, Observing
 from tilestream.dataflow.plan import DEFAULT_MEMORY, Plan, Task
 from tilestream.dataflow.run import Watch, execute
 from tilestream.errors import PartialError, UsageError
-from tilestream.factors.rows import samples_by_tile
+from tilestream.factors.rows import in_route_order, samples_by_tile
 from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.records import Route
 from tilestream.report.comparison import CELL_COLUMNS, ROW_COLUMNS, USUAL, Comparison
@@ -257,13 +257,11 @@ def rows_of(
     choice: Choice, tables: Sequence[str], routes: Sequence[str], store: TileStore
 ) -> pd.DataFrame:
     """The sample points of a choice from its tables, route by route and along each."""
-    rows = read_tables(tables)
-    order = {route: number for number, route in enumerate(routes)}
-    rows = rows.sort_values(["route_id", "sample"], key=lambda c: c.map(order).fillna(c))
+    rows = in_route_order(read_tables(tables), routes)
     rows["choice"] = choice.name
     places = zip(rows["x"], rows["y"], strict=True)
     rows["tile"] = [str(store.grid.key_at(x, y)) for x, y in places]
-    return rows[list(ROW_COLUMNS)].reset_index(drop=True)
+    return rows[list(ROW_COLUMNS)]
 
 
 def cells_of_map(plan: Plan, store: TileStore) -> pd.DataFrame:

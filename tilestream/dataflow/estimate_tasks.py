@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from tilestream.dataflow.localize_tasks import ERROR_COLUMNS, is_done
+from tilestream.dataflow.localize_tasks import ERROR_COLUMNS
 from tilestream.dataflow.plan import BASE_BYTES
 from tilestream.dataflow.tasks import perform
 from tilestream.errors import ModelError, SourceNotFoundError, TaskError
@@ -24,7 +24,7 @@ from tilestream.forest.protocols import PROTOCOLS
 from tilestream.forest.training import PREDICTION_COLUMNS, Model, predict, train
 from tilestream.records import Column
 from tilestream.store import hash_of
-from tilestream.tables import read_mark, read_tables, write_table
+from tilestream.tables import is_done, read_mark, read_tables, write_table
 from tilestream.tiling import TileKey
 from tilestream.version import VERSION
 

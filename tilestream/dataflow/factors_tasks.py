@@ -15,7 +15,7 @@ from tilestream.factors.table import TermsCache, factors
 from tilestream.factors.terms import terms_inputs, terms_table, tile_terms
 from tilestream.sensors import Sensor
 from tilestream.store import Mark, hash_of, open_store
-from tilestream.tables import read_mark, write_table
+from tilestream.tables import is_done, write_table
 from tilestream.tiling import MM_PER_M, TileKey
 from tilestream.version import VERSION
 
@@ -115,8 +115,7 @@ def _terms(task: TermsTask) -> Mark:
 @perform.register
 def _factors(task: FactorsTask) -> int:
     """Rows written; 0 where they were there."""
-    mark = read_mark(task.out)
-    if mark is not None and mark["identity"] == task.identity:
+    if is_done(task.out, task.identity):
         return 0
     store, looking = open_store(task.store_url), task.looking
     frame = sample_rows(task.samples, store, looking.sensor_height)

@@ -27,7 +27,7 @@ from tilestream.localization import (
 from tilestream.ndt import cells_of_mm
 from tilestream.records import Cells, Column, Float64, Scan, TruePose
 from tilestream.store import POINTS, Mark, TileStore, cells_table, hash_of, open_store
-from tilestream.tables import read_mark, read_tables, write_table
+from tilestream.tables import is_done, read_mark, read_tables, write_table
 from tilestream.tiling import MM_PER_M, Box, TileKey
 from tilestream.version import VERSION
 
@@ -412,12 +412,6 @@ def file_state(path: str) -> str:
     """Hash of the size and time of change of a file."""
     stat = Path(path).stat()
     return hash_of(path, stat.st_size, stat.st_mtime_ns)
-
-
-def is_done(path: str, identity: str) -> bool:
-    """Whether a whole table is there that was made from the same."""
-    mark = read_mark(path)
-    return mark is not None and mark["identity"] == identity
 
 
 @perform.register

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from tilestream.config import IngestSettings
+from tilestream.dataflow.along_routes import plan_factors, plan_observe
 from tilestream.dataflow.estimate_tasks import (
     COLUMNS,
     JOIN_VERSION,
@@ -21,33 +20,29 @@ from tilestream.dataflow.estimate_tasks import (
     predictions_identity,
     train_identity,
 )
-from tilestream.dataflow.factors_route import plan_factors
 from tilestream.dataflow.factors_tasks import FactorsTask, Looking
-from tilestream.dataflow.ingest_map import SourcesRead, plan_ingest, read_sources
-from tilestream.dataflow.ingest_tasks import ScatterTask
+from tilestream.dataflow.ingest_map import SourcesRead, read_sources
 from tilestream.dataflow.localize_drive import plan_localize
 from tilestream.dataflow.localize_tasks import LabelTask, Reading
-from tilestream.dataflow.observe_route import plan_observe
 from tilestream.dataflow.observe_tasks import ObserveTask, Observing
 from tilestream.dataflow.plan import Plan, Task
 from tilestream.dataflow.run import Watch
 from tilestream.dataflow.run_settings import DriveSettings, RunSettings, SimulateSettings
-from tilestream.dataflow.simulate import Stretch, plan_simulation, simulate
+from tilestream.dataflow.simulate import simulate
 from tilestream.dataflow.tasks import Outcome
-from tilestream.errors import SourceNotFoundError, StoreNotFoundError, UsageError
+from tilestream.errors import SourceNotFoundError, UsageError
 from tilestream.factors import catalogue
 from tilestream.factors.rows import samples_by_tile
 from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.forest.dataset import features_of, made_with
 from tilestream.forest.evaluation import factor_sets
 from tilestream.forest.models import COMPETITORS, OPPONENTS, PHYSICS
-from tilestream.formats import describe
 from tilestream.formats.mcap import ScanSelection
 from tilestream.formats.routes import read_routes
 from tilestream.records import Route
 from tilestream.simulation.settings import SimulationSettings, load_preset
-from tilestream.store import StoreSettings, TileStore, hash_of, open_store
-from tilestream.tiling import MM_PER_M, Box, TileKey
+from tilestream.store import TileStore, hash_of, open_store
+from tilestream.tiling import TileKey
 from tilestream.version import VERSION
 
 MAIN = "error_mean"
@@ -84,8 +79,8 @@ def inputs_of(settings: RunSettings, client: Any | None, watch: Watch | None) ->
         return Inputs(settings.map.sources, drives, _routes(files, settings))
     folder = simulated_folder(settings)
     wanted = settings.simulate
-    for drive in _simulations(wanted):
-        simulate(drive, folder, **_extent(wanted), client=client, watch=watch)
+    for drive in simulations(wanted):
+        simulate(drive, folder, **extent(wanted), client=client, watch=watch)
     logs = [
         DriveSettings(log=str(log), name=f"drive{drive}-{log.stem}")
         for drive in range(wanted.drives)
@@ -105,13 +100,13 @@ def inputs_of(settings: RunSettings, client: Any | None, watch: Watch | None) ->
     )
 
 
-def _simulations(wanted: SimulateSettings) -> list[SimulationSettings]:
+def simulations(wanted: SimulateSettings) -> list[SimulationSettings]:
     """The experiment of each drive."""
     preset = load_preset(wanted.preset).model_copy(update={"seed": wanted.seed})
     return [preset.model_copy(update={"drive": drive}) for drive in range(wanted.drives)]
 
 
-def _extent(wanted: SimulateSettings) -> dict[str, Any]:
+def extent(wanted: SimulateSettings) -> dict[str, Any]:
     """How much of the city is simulated, as `simulate` and its plan take it."""
     return {
         "paths": wanted.paths,
@@ -379,88 +374,3 @@ def judges(join: JoinTask, folder: str, seed: int, observed: bool) -> list[Task]
     ]
     weigh = hash_of(join.identity, seed, TRAIN_VERSION, VERSION)
     return [*tasks, WeighTask(join.out, seed, f"{folder}/weights.parquet", weigh)]
-
-
-@dataclass(frozen=True)
-class Forecast:
-    """What a job would do, told before it does anything."""
-
-    tasks: tuple[Task, ...]
-    """The tasks, each after those that it needs; of the map's tiles, those that there may be; of a
-    city that is not simulated yet, those that make it."""
-    notes: tuple[str, ...]
-    """What is not known before the job runs."""
-
-
-def forecast(settings: RunSettings) -> Forecast:
-    """What the main job would run; nothing is read beyond headers, nothing is written.
-
-    Raises:
-        PlanError: a task does not fit `memory`.
-        UsageError, SourceError, StoreError: as the job itself.
-    """
-    if settings.simulate is not None and not is_simulated(settings):
-        return _simulation_first(settings, settings.simulate)
-    inputs = inputs_of(settings, None, None)
-    store, reading, have, notes = _expected_map(settings, inputs)
-    measure = plan_measure(settings, inputs, store, (), have)
-    done = [Outcome(task.key, task.stage, None) for task in measure.tasks]
-    estimate = plan_estimate(settings, measure, done)
-    return Forecast((*reading, *measure.tasks, *estimate.tasks), tuple(notes))
-
-
-def _simulation_first(settings: RunSettings, wanted: SimulateSettings) -> Forecast:
-    """What simulates the city, as far as it is not there."""
-    folder = simulated_folder(settings)
-    plans = [plan_simulation(drive, folder, **_extent(wanted)) for drive in _simulations(wanted)]
-    missing = {
-        task.path: task
-        for plan in plans
-        for task in plan.tasks
-        if isinstance(task, Stretch) and not Path(task.path).exists()
-    }  # all drives have one survey
-    note = f"first the city is simulated in {folder}; plan again to see what follows"
-    return Forecast(tuple(missing.values()), (note,))
-
-
-def _expected_map(
-    settings: RunSettings, inputs: Inputs
-) -> tuple[TileStore, tuple[Task, ...], dict[TileKey, str], list[str]]:
-    """The store as it is, or as the bounds of its sources let expect it."""
-    try:
-        store = open_store(settings.store_url)
-    except StoreNotFoundError:
-        if not inputs.sources:
-            raise
-    else:
-        if store.sources():
-            return (
-                store,
-                (),
-                store.identities(),
-                ["the map is there; changed sources are read again"],
-            )
-    plan = plan_ingest(
-        inputs.sources,
-        settings.store_url,
-        ingest_settings(settings),
-        settings.memory,
-        settings.map.points_topic,
-        settings.map.pose_topic,
-        map_scans(settings, inputs),
-    )
-    store = TileStore(settings.store_url, StoreSettings(**ingest_settings(settings).model_dump()))
-    have: dict[TileKey, str] = {}
-    unknown: list[str] = []
-    for path in sorted({task.source for task in plan.tasks if isinstance(task, ScatterTask)}):
-        bounds = describe(path).bounds
-        if bounds is None:
-            unknown.append(path)
-        else:
-            low, high = (np.round(np.array(corner) * MM_PER_M).astype(int) for corner in bounds)
-            box = Box(int(low[0]), int(low[1]), int(high[0]) + 1, int(high[1]) + 1)
-            have |= dict.fromkeys(store.grid.keys_over(box), "expected")
-    notes = [f"at most {len(have)} tiles, by the bounds of the sources; reading tells which"]
-    if unknown:
-        notes.append(f"only reading tells where the points of {', '.join(unknown[:3])} are")
-    return store, plan.tasks, have, notes

@@ -21,7 +21,7 @@ from tilestream.factors.surfels import (
 from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.sensors import Sensor
 from tilestream.store import Mark, hash_of, open_store
-from tilestream.tables import read_mark, write_table
+from tilestream.tables import is_done, write_table
 from tilestream.tiling import TileKey
 from tilestream.version import VERSION
 
@@ -138,8 +138,7 @@ def _surfels(task: SurfelsTask) -> Mark:
 @perform.register
 def _observe(task: ObserveTask) -> int:
     """Rows written; 0 where they were there."""
-    mark = read_mark(task.out)
-    if mark is not None and mark["identity"] == task.identity:
+    if is_done(task.out, task.identity):
         return 0
     store, how = open_store(task.store_url), task.observing
     frame = sample_rows(task.samples, store, how.sensor_height)

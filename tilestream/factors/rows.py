@@ -118,6 +118,13 @@ def _samples_of(pieces: Sequence[tuple[str, NDArray[np.void]]]) -> Samples:
     return Samples(tuple(number), rows)
 
 
+def in_route_order(rows: pd.DataFrame, route_ids: Sequence[str]) -> pd.DataFrame:
+    """Rows of sample points in the order of these routes and along each."""
+    order = {route_id: number for number, route_id in enumerate(route_ids)}
+    rows = rows.sort_values(["route_id", "sample"], key=lambda c: c.map(order).fillna(c))
+    return rows.reset_index(drop=True)
+
+
 def sample_rows(samples: Samples, store: TileStore, sensor_height: float) -> pd.DataFrame:
     """Sample points as rows of `PLACE_COLUMNS`, raised to the lidar.
 

@@ -14,16 +14,17 @@ from tilestream.report.comparison import QUANTILE, USUAL, Comparison
 from tilestream.report.exports import write_csv, write_json, write_text
 from tilestream.report.judgement import APART
 from tilestream.report.page import document
-from tilestream.report.sections import empty, section
 from tilestream.report.summary import with_gaps
 from tilestream.report.words import (
     CM_PER_M,
     DASH,
     count,
+    empty,
     esc,
     known,
     length,
     percent,
+    section,
     table,
 )
 

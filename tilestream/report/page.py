@@ -7,7 +7,7 @@ from typing import Any
 
 from bokeh.resources import Resources
 
-from tilestream.report import sections
+from tilestream.report import evidence, places
 from tilestream.report.charts import city_map, path_chart
 from tilestream.report.findings import Findings
 from tilestream.report.words import esc
@@ -34,18 +34,18 @@ def page(found: Findings, content: Mapping[str, Any], pictures: Mapping[int, byt
         pictures: PNG of each of the worst places by number, or why there is none.
     """
     parts = (
-        sections.headline(content),
-        sections.city_map(found, content),
-        sections.worst(content, pictures),
-        sections.paths(content),
-        sections.importances(found),
-        sections.table_iv(found),
-        sections.calibration(found),
-        sections.protocols(found),
-        sections.facts(content),
+        places.headline(content),
+        places.city_map(found, content),
+        places.worst(content, pictures),
+        places.paths(content),
+        evidence.importances(found),
+        evidence.table_iv(found),
+        evidence.calibration(found),
+        evidence.protocols(found),
+        places.facts(content),
     )
     charts = [city_map(found)]
-    for number, path in enumerate(content["paths"][: sections.MOST_PATHS]):
+    for number, path in enumerate(content["paths"][: places.MOST_PATHS]):
         charts.append(path_chart(found, path["path"]) | {"target_id": f"path-{number}"})
     return document(
         found.title,

@@ -91,3 +91,15 @@ def bar(share: float, colour: str) -> str:
     """A horizontal bar, 0 to 1 of its cell."""
     width = 100.0 * min(max(share, 0.0), 1.0)
     return f'<span class="bar"><i style="width:{width:.1f}%;background:{colour}"></i></span>'
+
+
+def section(name: str, title: str, meaning: str, body: str) -> str:
+    """A section of the page: a heading, what it means in a sentence, and its content."""
+    return (
+        f'<section id="{name}"><h2>{title}</h2><p class="meaning">{meaning}</p>{body}</section>\n'
+    )
+
+
+def empty(why: str) -> str:
+    """What stands where there is nothing to show."""
+    return f'<p class="empty">{why}</p>'

@@ -1,0 +1,114 @@
+"""What the main job would run, from headers alone: before anything is read or written."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tilestream.dataflow.ingest_map import plan_ingest
+from tilestream.dataflow.ingest_tasks import ScatterTask
+from tilestream.dataflow.main_plan import (
+    Inputs,
+    extent,
+    ingest_settings,
+    inputs_of,
+    is_simulated,
+    map_scans,
+    plan_estimate,
+    plan_measure,
+    simulated_folder,
+    simulations,
+)
+from tilestream.dataflow.plan import Task
+from tilestream.dataflow.run_settings import RunSettings, SimulateSettings
+from tilestream.dataflow.simulate import Stretch, plan_simulation
+from tilestream.dataflow.tasks import Outcome
+from tilestream.errors import StoreNotFoundError
+from tilestream.formats import describe
+from tilestream.store import StoreSettings, TileStore, open_store
+from tilestream.tiling import MM_PER_M, Box, TileKey
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """What a job would do, told before it does anything."""
+
+    tasks: tuple[Task, ...]
+    """The tasks, each after those that it needs; of the map's tiles, those that there may be; of a
+    city that is not simulated yet, those that make it."""
+    notes: tuple[str, ...]
+    """What is not known before the job runs."""
+
+
+def forecast(settings: RunSettings) -> Forecast:
+    """What the main job would run; nothing is read beyond headers, nothing is written.
+
+    Raises:
+        PlanError: a task does not fit `memory`.
+        UsageError, SourceError, StoreError: as the job itself.
+    """
+    if settings.simulate is not None and not is_simulated(settings):
+        return _simulation_first(settings, settings.simulate)
+    inputs = inputs_of(settings, None, None)
+    store, reading, have, notes = _expected_map(settings, inputs)
+    measure = plan_measure(settings, inputs, store, (), have)
+    done = [Outcome(task.key, task.stage, None) for task in measure.tasks]
+    estimate = plan_estimate(settings, measure, done)
+    return Forecast((*reading, *measure.tasks, *estimate.tasks), tuple(notes))
+
+
+def _simulation_first(settings: RunSettings, wanted: SimulateSettings) -> Forecast:
+    """What simulates the city, as far as it is not there."""
+    folder = simulated_folder(settings)
+    plans = [plan_simulation(drive, folder, **extent(wanted)) for drive in simulations(wanted)]
+    missing = {
+        task.path: task
+        for plan in plans
+        for task in plan.tasks
+        if isinstance(task, Stretch) and not Path(task.path).exists()
+    }  # all drives have one survey
+    note = f"first the city is simulated in {folder}; plan again to see what follows"
+    return Forecast(tuple(missing.values()), (note,))
+
+
+def _expected_map(
+    settings: RunSettings, inputs: Inputs
+) -> tuple[TileStore, tuple[Task, ...], dict[TileKey, str], list[str]]:
+    """The store as it is, or as the bounds of its sources let expect it."""
+    try:
+        store = open_store(settings.store_url)
+    except StoreNotFoundError:
+        if not inputs.sources:
+            raise
+    else:
+        if store.sources():
+            return (
+                store,
+                (),
+                store.identities(),
+                ["the map is there; changed sources are read again"],
+            )
+    plan = plan_ingest(
+        inputs.sources,
+        settings.store_url,
+        ingest_settings(settings),
+        settings.memory,
+        settings.map.points_topic,
+        settings.map.pose_topic,
+        map_scans(settings, inputs),
+    )
+    store = TileStore(settings.store_url, StoreSettings(**ingest_settings(settings).model_dump()))
+    have: dict[TileKey, str] = {}
+    unknown: list[str] = []
+    for path in sorted({task.source for task in plan.tasks if isinstance(task, ScatterTask)}):
+        bounds = describe(path).bounds
+        if bounds is None:
+            unknown.append(path)
+        else:
+            low, high = (np.round(np.array(corner) * MM_PER_M).astype(int) for corner in bounds)
+            box = Box(int(low[0]), int(low[1]), int(high[0]) + 1, int(high[1]) + 1)
+            have |= dict.fromkeys(store.grid.keys_over(box), "expected")
+    notes = [f"at most {len(have)} tiles, by the bounds of the sources; reading tells which"]
+    if unknown:
+        notes.append(f"only reading tells where the points of {', '.join(unknown[:3])} are")
+    return store, plan.tasks, have, notes
