@@ -1,11 +1,9 @@
 """Cells: exact sums against whole numbers, eigenvectors and normals against numpy, any order."""
 
-import os
-import subprocess
-import sys
 from fractions import Fraction
 from pathlib import Path
 
+import interpreted
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -363,15 +361,7 @@ def test_no_points_are_no_cells() -> None:
     assert cells.regularised.shape == (0, 3, 3)
 
 
-@pytest.mark.skipif(bool(os.environ.get("NUMBA_DISABLE_JIT")), reason="is the inner run")
+@interpreted.outer
 def test_the_kernels_are_the_same_without_the_compiler() -> None:
-    names = "plain_loop or lapack or diagonal or floors or pole or lattice_planes or fractions"
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-k", names, __file__],
-        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout[-2000:]
-    assert " passed" in done.stdout
+    chosen = "plain_loop or lapack or diagonal or floors or pole or lattice_planes or fractions"
+    assert interpreted.passed(__file__, chosen) == 14

@@ -1,9 +1,6 @@
 """Distances of points to the nearest mean, against plain NumPy over all cells."""
 
-import os
-import subprocess
-import sys
-
+import interpreted
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -129,15 +126,7 @@ def test_groups_hold_each_point_once() -> None:
     assert [sorted(order[a:b]) for a, b in ((0, 2), (2, 5))] == [[2, 6], [0, 3, 4]]
 
 
-@pytest.mark.skipif("NUMBA_DISABLE_JIT" in os.environ, reason="is itself the run without the JIT")
+@interpreted.outer
 def test_the_kernels_say_the_same_without_the_compiler() -> None:
     chosen = "(plain_numpy and 2000 and offset0) or each_point_once or without_points"
-    result = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-k", chosen, __file__],
-        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert result.returncode == 0, result.stdout
-    assert "3 passed" in result.stdout
+    assert interpreted.passed(__file__, chosen) == 3

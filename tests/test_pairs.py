@@ -1,10 +1,8 @@
 """Neighbours, PFH and Bhattacharyya against plain NumPy, and their laws."""
 
-import os
-import subprocess
-import sys
 from itertools import combinations, pairwise
 
+import interpreted
 import numpy as np
 import pytest
 from hypothesis import given
@@ -240,15 +238,7 @@ def test_a_street_has_the_same_terms_as_plain_numpy(shared_data) -> None:
         assert np.array_equal(counts[c], plain_counts(mean, normal, only)[c])
 
 
-@pytest.mark.skipif("NUMBA_DISABLE_JIT" in os.environ, reason="is itself the run without the JIT")
+@interpreted.outer
 def test_the_kernels_say_the_same_without_the_compiler() -> None:
     chosen = "(plain_numpy or fewer_than_three or at_the_radius or identical) and not street"
-    result = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-k", chosen, __file__],
-        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert result.returncode == 0, result.stdout
-    assert "passed" in result.stdout
+    assert interpreted.passed(__file__, chosen) == 7

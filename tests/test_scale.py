@@ -1,11 +1,7 @@
 """A synthetic city: the same bits from any way of running, and a client that stays small."""
 
-import os
-import socket
 import subprocess
 import sys
-import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import city_tiles
@@ -69,53 +65,14 @@ def test_any_number_of_workers_writes_the_bytes_of_a_serial_run(
     assert digest(tmp_path / "tcp") == digest(tmp_path / "local") == serial
 
 
-@pytest.fixture
-def bucket(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """A bucket of a real S3 server process on loopback."""
-    s3fs = pytest.importorskip("s3fs", reason="needs the extra s3")
-    pytest.importorskip("moto.server", reason="needs moto's S3 server")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    for name, value in {
-        "AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}",
-        "AWS_ACCESS_KEY_ID": "test",
-        "AWS_SECRET_ACCESS_KEY": "test",
-        "AWS_DEFAULT_REGION": "us-east-1",
-        "NO_PROXY": "127.0.0.1",
-    }.items():
-        monkeypatch.setenv(name, value)
-    server = subprocess.Popen(
-        [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        env=dict(os.environ),
-    )
-    try:
-        until = time.monotonic() + 30.0
-        while True:
-            with socket.socket() as probe:
-                if probe.connect_ex(("127.0.0.1", port)) == 0:
-                    break
-            assert time.monotonic() < until, "no S3 server within 30 s"
-            time.sleep(0.1)
-        s3fs.S3FileSystem.clear_instance_cache()
-        s3fs.S3FileSystem().mkdir("city")
-        yield "s3://city"
-    finally:
-        server.kill()
-        server.wait()
-        s3fs.S3FileSystem.clear_instance_cache()
-
-
 @pytest.mark.slow
 def test_a_job_over_the_s3_protocol_gives_the_same_store_and_tables(
-    city: Path, tmp_path: Path, bucket: str
+    city: Path, tmp_path: Path, s3_bucket: str
 ) -> None:
     run_city(city, str(tmp_path), N, SIZE)
     with dask_client(None, 2, 10**9) as client:
-        run_city(city, f"{bucket}/run", N, SIZE, client=client)
-    near, far = ts.open_store(f"{tmp_path}/map.zarr"), ts.open_store(f"{bucket}/run/map.zarr")
+        run_city(city, f"{s3_bucket}/run", N, SIZE, client=client)
+    near, far = ts.open_store(f"{tmp_path}/map.zarr"), ts.open_store(f"{s3_bucket}/run/map.zarr")
     assert far.marks() == near.marks()
     for key in near.keys():
         np.testing.assert_array_equal(far.tile(key).points(), near.tile(key).points())
@@ -123,7 +80,7 @@ def test_a_job_over_the_s3_protocol_gives_the_same_store_and_tables(
     assert {path.split("/")[0] for path in tables} == {"factors", "errors", "starts"}
     for path in tables:
         pd.testing.assert_frame_equal(
-            pd.read_parquet(f"{bucket}/run/{path}"), pd.read_parquet(tmp_path / path)
+            pd.read_parquet(f"{s3_bucket}/run/{path}"), pd.read_parquet(tmp_path / path)
         )
 
 

@@ -1,9 +1,6 @@
 """The 441 scores of a cell's points against plain NumPy over all cells; the factors from them."""
 
-import os
-import subprocess
-import sys
-
+import interpreted
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -192,15 +189,7 @@ def test_a_whole_street_equals_plain_numpy(shared_data) -> None:
     assert_scores_equal(m, list(range(0, len(m.index), 40)))
 
 
-@pytest.mark.skipif("NUMBA_DISABLE_JIT" in os.environ, reason="is itself the run without the JIT")
+@interpreted.outer
 def test_the_kernel_says_the_same_without_the_compiler() -> None:
     chosen = "single_small or power_of_two"
-    result = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-k", chosen, __file__],
-        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert result.returncode == 0, result.stdout
-    assert "2 passed" in result.stdout
+    assert interpreted.passed(__file__, chosen) == 2

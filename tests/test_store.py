@@ -1,14 +1,8 @@
 """The tile store: marks, halo reads, versions, remote protocols."""
 
 import json
-import os
 import pickle
-import socket
-import subprocess
-import sys
-import time
 import uuid
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -202,50 +196,6 @@ def test_memory_stores_work(tmp_path: Path, cloud: np.ndarray) -> None:
     made = ts.ingest(tmp_path / "map.pcd", f"memory://{uuid.uuid4().hex}/map.zarr", map_leaf=0.0)
     stored = np.concatenate([made.tile(key).points() for key in made.keys()])
     assert as_set(stored) == as_set(cloud[:1000])
-
-
-@pytest.fixture
-def s3_bucket(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """A bucket of a real S3 server process on loopback."""
-    s3fs = pytest.importorskip("s3fs", reason="needs the extra s3")
-    pytest.importorskip("moto.server", reason="needs moto's S3 server")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    server = subprocess.Popen(
-        [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        env={**os.environ, "NO_PROXY": "127.0.0.1"},
-    )
-    try:
-        endpoint = f"http://127.0.0.1:{port}"
-        for name, value in {
-            "AWS_ENDPOINT_URL": endpoint,
-            "AWS_ACCESS_KEY_ID": "test",
-            "AWS_SECRET_ACCESS_KEY": "test",
-            "AWS_DEFAULT_REGION": "us-east-1",
-            "NO_PROXY": "127.0.0.1",
-        }.items():
-            monkeypatch.setenv(name, value)
-        wait_for_port(port)
-        s3fs.S3FileSystem.clear_instance_cache()
-        s3fs.S3FileSystem().mkdir("maps")
-        yield "s3://maps"
-    finally:
-        server.kill()
-        server.wait()
-        s3fs.S3FileSystem.clear_instance_cache()
-
-
-def wait_for_port(port: int) -> None:
-    end = time.monotonic() + 30.0
-    while time.monotonic() < end:
-        with socket.socket() as probe:
-            if probe.connect_ex(("127.0.0.1", port)) == 0:
-                return
-        time.sleep(0.1)
-    pytest.fail(f"no server on port {port} within 30 s")
 
 
 def test_a_store_over_the_s3_protocol_holds_the_same_tiles(

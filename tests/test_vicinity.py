@@ -1,9 +1,6 @@
 """What a sample point sees: membership, integer sums, depth images, against plain NumPy twins."""
 
-import os
-import subprocess
-import sys
-
+import interpreted
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -322,15 +319,7 @@ def test_the_weak_axis_of_a_tunnel_is_its_own(angle: float) -> None:
     assert 0.0 <= weak[0] < np.pi
 
 
-@pytest.mark.skipif(bool(os.environ.get("NUMBA_DISABLE_JIT")), reason="is the inner run")
+@interpreted.outer
 def test_the_kernels_are_the_same_without_the_compiler() -> None:
-    names = "few_cells or few_points or on_edges or half_to_even"
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-k", names, __file__],
-        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout[-2000:]
-    assert " passed" in done.stdout
+    chosen = "few_cells or few_points or on_edges or half_to_even"
+    assert interpreted.passed(__file__, chosen) == 4

@@ -1,11 +1,9 @@
 """The virtual scan: closed forms, a literal reference, invariances, any tiling, no leaks."""
 
-import os
-import subprocess
-import sys
 from itertools import pairwise, product
 from pathlib import Path
 
+import interpreted
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -424,15 +422,7 @@ def test_a_place_in_a_wall_is_crowded_and_one_beside_it_is_not() -> None:
         assert low <= crowded(scene, place, beams, 0.9) <= high
 
 
-@pytest.mark.skipif("NUMBA_DISABLE_JIT" in os.environ, reason="is itself the run without the JIT")
+@interpreted.outer
 def test_the_kernels_say_the_same_without_the_compiler() -> None:
     chosen = "literal_reference or decide_a_surfel"
-    result = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-k", chosen, __file__],
-        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert result.returncode == 0, result.stdout
-    assert "2 passed" in result.stdout
+    assert interpreted.passed(__file__, chosen) == 2
