@@ -236,6 +236,21 @@ def test_a_wider_crop_of_the_map_shows_nothing_more(store: ts.TileStore) -> None
     assert len(in_view(nothing, place, SENSOR.fov_deg, 15.0)) == 0
 
 
+def test_traffic_in_the_map_is_looked_through_and_reported(tmp_path: Path) -> None:
+    """A car that passed, without a hole in the ground beneath it."""
+    street = PLACES["canyon"](np.random.default_rng(3), 40.0, 0.15)
+    car = np.random.default_rng(4).uniform((24, -1, 0.5), (28, 1, 1.6), (4000, 3))
+    path = tmp_path / "street.pcd"
+    write_pcd(path, np.vstack([street, car]))
+    store = ts.ingest(path, tmp_path / "map.zarr")
+    seen = SEEING.model_copy(update={"without_ghosts": False})
+    left_out, kept = (look(store, [PLACE], [0.0], seeing=s).iloc[0] for s in (SEEING, seen))
+    assert left_out["status"] == kept["status"] == "done"
+    assert kept["ob_ghosts"] == 0.0
+    assert 0.01 < left_out["ob_ghosts"] < 0.2
+    assert left_out["vd_mean"] != kept["vd_mean"]
+
+
 def test_the_rim_of_the_map_shows_in_the_unmapped_share(store: ts.TileStore) -> None:
     table = look(store, [[20.0, 0.5, 2.0], [39.5, 0.5, 2.0]], [0.0, 0.0])
     assert table["status"].tolist() == ["done", "done"]

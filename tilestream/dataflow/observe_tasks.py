@@ -27,7 +27,7 @@ from tilestream.version import VERSION
 
 SURFELS_VERSION = 1
 """Raise it when the surfels that are made from the same points change."""
-OBSERVE_VERSION = 1
+OBSERVE_VERSION = 2
 """Raise it when what is observed from the same surfels and cells changes."""
 SURFELS_BYTES = 400_000_000
 """Memory of a surfels task beyond the interpreter: the points of a tile, some of their planes."""

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from tilestream.config import RegistrationSettings
 from tilestream.errors import RegistrationError, TileNotReadyError, UsageError
 from tilestream.factors import virtual_drive
+from tilestream.factors.ghosts import REACH_EDGES, ghosts_among
 from tilestream.factors.surfels import Surfels, surfel_mm, surfels_in
 from tilestream.factors.table import NO_GROUND, places_of
 from tilestream.factors.virtual_drive import stratified_starts
@@ -25,6 +26,7 @@ from tilestream.factors.virtual_scan import (
     VirtualScan,
     VirtualSettings,
     crowded,
+    first_returns,
     virtual_scan,
 )
 from tilestream.kernels.cells import cell_of_points, cell_sums
@@ -75,6 +77,7 @@ VIEW_COLUMNS = (
     _column("ob_cells", "1", "Cells whose voxels these points hit."),
     _column("ob_returns", "1", "Share of the beams that come back."),
     _column("ob_unmapped", "1", "Share of the beams that meet nothing and leave the mapped area."),
+    _column("ob_ghosts", "1", "Share of the beams that traffic in the map would stop, left out."),
 )
 COLUMNS = (*HESSIAN_COLUMNS, *VIEW_COLUMNS, *virtual_drive.COLUMNS)
 """All columns of the criterion."""
@@ -107,7 +110,7 @@ def observability(
     Returns:
         A row per position: `COLUMNS`, then `status` and `reason`. `missing`: no ground, or nothing
         in view. `failed`: inside a wall, too little for the matcher, or a tile in range failed. All
-        columns are NaN there, but for `ob_returns` and `ob_unmapped` where a scan was taken.
+        columns are NaN there, but for those of the view where a scan was taken.
 
     Raises:
         UsageError: positions or headings of another shape or not finite, a cell size of which the
@@ -157,7 +160,7 @@ class _View:
         Where a part of it cannot be read, each place looks alone: so none fails for another one.
         """
         try:
-            surfels, cells = self.around(places[some])
+            surfels, ghosts, cells = self.around(places[some])
         except TileNotReadyError as error:
             if len(some) == 1:
                 yield int(some[0]), {"status": "failed", "reason": str(error)}
@@ -166,23 +169,38 @@ class _View:
                 yield from self.rows(places, turns, np.array([row]))
             return
         for block in blocks_of(places, some):
-            scene = self.scene(surfels, places[block])
+            scenes = [self.scene(those, places[block]) for those in (surfels, ghosts)]
             for row in block:
-                yield int(row), self.seen_from(scene, cells, places[row], turns[row])
+                yield int(row), self.seen_from(*scenes, cells, places[row], turns[row])
 
-    def around(self, places: Float64) -> tuple[Surfels, Cells]:
-        """What of the map can be seen from the places, and the cells around that."""
-        reach = self.beams.range_max
-        surfels = surfels_in(self.store, box_around(places, reach + 1.0))
+    def around(self, places: Float64) -> tuple[Surfels, Surfels, Cells]:
+        """What of the map can be seen from the places, the ghosts, and the cells around that."""
+        reach, edge_mm = self.beams.range_max, surfel_mm(self.store)
+        rim = 1.0 + REACH_EDGES * edge_mm / MM_PER_M
+        surfels = surfels_in(self.store, box_around(places, reach + rim))
         cells = self.store.cells_in(box_around(places, reach + MARGIN), self.cell_size)
-        return in_view(surfels, places, self.sensor.fov_deg, reach), cells
+        ghost = np.zeros(len(surfels), np.bool_)
+        if self.seeing.without_ghosts:
+            ghost = ghosts_among(surfels, edge_mm)
+        real, ghosts = (
+            in_view(surfels.where(chosen), places, self.sensor.fov_deg, reach)
+            for chosen in (~ghost, ghost)
+        )
+        return real, ghosts, cells
 
     def scene(self, surfels: Surfels, places: Float64) -> Scene | None:
         """What places near one another see; None: nothing."""
         near = in_view(surfels, places, self.sensor.fov_deg, self.beams.range_max)
         return Scene.of(near, whole_places(places), surfel_mm(self.store)) if len(near) else None
 
-    def seen_from(self, scene: Scene | None, cells: Cells, place: Float64, heading: float) -> Row:
+    def seen_from(
+        self,
+        scene: Scene | None,
+        ghosts: Scene | None,
+        cells: Cells,
+        place: Float64,
+        heading: float,
+    ) -> Row:
         """The row of a place, without what is missing there."""
         n = len(self.beams.direction)
         if scene is None:
@@ -196,6 +214,7 @@ class _View:
         view: Row = {
             "ob_returns": scan.return_share,
             "ob_unmapped": scan.unmapped_share,
+            "ob_ghosts": self.hidden_by(ghosts, scan, place_mm, heading),
         }
         if not len(scan.points):
             return {**view, "status": "missing", "reason": NOTHING.format(0, n)}
@@ -208,6 +227,15 @@ class _View:
             }
         except RegistrationError as error:
             return {**view, "status": "failed", "reason": str(error)}
+
+    def hidden_by(
+        self, ghosts: Scene | None, scan: VirtualScan, place_mm: Int64, heading: float
+    ) -> float:
+        """Share of the beams that ghosts would stop before they meet what the scan says."""
+        if ghosts is None:
+            return 0.0
+        ranges, _, _ = first_returns(ghosts, place_mm, heading, self.seeing, self.beams)
+        return float((ranges < scan.ranges).mean())
 
     def _held(
         self, cells: Cells, scan: VirtualScan, place_mm: Int64, heading: float

@@ -35,7 +35,7 @@ COLUMNS = (
 )
 
 
-def stratified_starts(count: int | None = 32) -> tuple[Float64, Float64]:
+def stratified_starts(count: int | None = 64) -> tuple[Float64, Float64]:
     """Some of the paper's 317 starts, spread evenly round each of three rings of their disc.
 
     Args:

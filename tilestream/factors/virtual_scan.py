@@ -46,7 +46,10 @@ class VirtualSettings(Settings):
     """… up to this share of them at its end, linearly."""
     grazing_deg: Annotated[float, Field(gt=0.0, lt=90.0)] = 75.0
     """Angle of incidence beyond which returns get lost, as its cosine falls to 0 [deg]."""
-    starts: Annotated[int, Field(ge=8)] | None = 32
+    without_ghosts: bool = True
+    """Whether traffic that was baked into the map is left out, see `ghosts.py`; also some thin
+    things are, such as posts."""
+    starts: Annotated[int, Field(ge=8)] | None = 64
     """Starts of the virtual drive, spread over the disc of starts; None: all of them."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     """Of noise and drop-outs, which the place decides together with it."""
@@ -177,22 +180,35 @@ def virtual_scan(
         seeing: its drop-outs.
         beams: its beams, `Beams.of(sensor, seeing)`.
     """
-    c, s = np.cos(heading), np.sin(heading)
-    R_map_lidar = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    direction = beams.direction @ R_map_lidar.T
-    n, reach = len(direction), beams.range_max * MM_PER_M
-    ranges, cosine = np.empty(n), np.empty(n)
-    near = seeing.range_min * MM_PER_M
-    cast(scene.bricks, place_mm, direction, near, reach, ranges, cosine)
+    ranges, cosine, direction = first_returns(scene, place_mm, heading, seeing, beams)
+    reach = beams.range_max * MM_PER_M
     left = leave_map(
         scene.mapped, scene.mapped_corner, COLUMN_MM, place_mm, direction, ranges, reach
     )
-    luck, radius, turn = draws(place_mm, seeing.seed, n, 3)
+    luck, radius, turn = draws(place_mm, seeing.seed, len(ranges), 3)
     came = luck < probability(ranges, cosine, beams.range_max, seeing)
     noise = np.sqrt(-2.0 * np.log(radius[came])) * np.cos(2.0 * np.pi * turn[came])
     measured = ranges[came] + sensor.range_noise * noise
     points = beams.direction[came] * measured[:, None]
     return VirtualScan(ranges, cosine, came, points, float(came.mean()), float(left.mean()))
+
+
+def first_returns(
+    scene: Scene, place_mm: Int64, heading: float, seeing: VirtualSettings, beams: Beams
+) -> tuple[Float64, Float64, Float64]:
+    """What the beams of a lidar at a place meet first; arguments as of `virtual_scan`.
+
+    Returns:
+        (n,) ranges [m], inf where nothing is met; (n,) cosines of incidence, 0 there; (n, 3)
+        directions in the map frame.
+    """
+    c, s = np.cos(heading), np.sin(heading)
+    R_map_lidar = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    direction = beams.direction @ R_map_lidar.T
+    ranges, cosine = np.empty(len(direction)), np.empty(len(direction))
+    near, reach = seeing.range_min * MM_PER_M, beams.range_max * MM_PER_M
+    cast(scene.bricks, place_mm, direction, near, reach, ranges, cosine)
+    return ranges, cosine, direction
 
 
 def probability(

@@ -1,0 +1,113 @@
+"""Ghosts: traffic that was baked into the map is told from what stands there."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tilestream.factors.ghosts import (
+    AROUND,
+    BLOCK,
+    HIGH_MM,
+    LOW_MM,
+    OPEN,
+    REACH_EDGES,
+    ghosts_among,
+)
+from tilestream.factors.surfels import Surfels
+
+EDGE = 200
+Mask = np.ndarray
+
+
+def balls(centre_mm: np.ndarray) -> Surfels:
+    n = len(centre_mm)
+    return Surfels(centre_mm, np.zeros((n, 3), np.int16), np.full(n, 100, np.int32))
+
+
+def box(low: tuple[int, int, int], high: tuple[int, int, int]) -> np.ndarray:
+    """A point in the middle of every voxel of a box, given in voxels."""
+    axes = [np.arange(a, b) for a, b in zip(low, high, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3) * EDGE + EDGE // 2
+
+
+def street() -> tuple[Surfels, dict[str, Mask]]:
+    """Ground of 40 m x 12 m, and on it a car that passed, one that stayed, a tree, a facade."""
+    ground = box((0, 0, 0), (200, 60, 1))
+    under = (np.abs(ground[:, :2] - (20_000, 6_000)) < (2_300, 900)).all(axis=1)
+    parts = {
+        "ground": ground[~under],  # none is seen beneath the parked car
+        "passed": box((30, 25, 2), (52, 33, 8)),
+        "parked": box((89, 26, 2), (111, 34, 8)),
+        "crown": box((140, 20, 18), (160, 40, 25)),
+        "trunk": box((149, 29, 1), (151, 31, 18)),
+        "facade": box((0, 59, 1), (200, 60, 50)),
+    }
+    of = np.repeat(list(parts), [len(part) for part in parts.values()])
+    return balls(np.concatenate(list(parts.values()))), {name: of == name for name in parts}
+
+
+def test_what_passed_is_a_ghost_and_what_stands_is_not() -> None:
+    surfels, of = street()
+    ghost = ghosts_among(surfels, EDGE)
+    height = surfels.centre_mm[:, 2] - EDGE // 2
+    assert ghost[of["passed"] & (height > LOW_MM)].all()
+    assert (of["passed"] & ghost).sum() > 500
+    for name in ("ground", "parked", "crown", "trunk", "facade"):
+        assert not ghost[of[name]].any(), name
+
+
+@pytest.mark.parametrize("shift", [(0, 0, 137), (-33_000, 12_000, -5_001), (3 * 10**8, 10**9, 0)])
+def test_whole_metres_of_translation_do_not_show(shift: tuple[int, int, int]) -> None:
+    surfels, _ = street()
+    moved = balls(surfels.centre_mm + np.array(shift))
+    np.testing.assert_array_equal(ghosts_among(moved, EDGE), ghosts_among(surfels, EDGE))
+
+
+def literal(centre_mm: np.ndarray) -> Mask:
+    """The definition, one surfel after the other."""
+    column = centre_mm[:, :2] // EDGE
+    block = column // BLOCK
+    found = np.zeros(len(centre_mm), np.bool_)
+    for row, z in enumerate(centre_mm[:, 2]):
+
+        def shows(at: np.ndarray) -> bool:
+            here = centre_mm[(column == at).all(axis=1), 2]
+            near = (np.abs(block - at // BLOCK) <= 1).all(axis=1)
+            if not len(here):
+                return False
+            low = centre_mm[near, 2].min()
+            return bool(here.min() <= low + LOW_MM and here.max() <= low + HIGH_MM)
+
+        near = (np.abs(block - block[row]) <= 1).all(axis=1)
+        height = z - centre_mm[near, 2].min()
+        if LOW_MM < height <= HIGH_MM and shows(column[row]):
+            steps = range(-AROUND, AROUND + 1)
+            around = [shows(column[row] + (i, j)) for i in steps for j in steps]
+            found[row] = sum(around) >= OPEN * len(around)
+    return found
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_the_ghosts_are_those_of_the_literal_reference(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    ground = box((-9, -6, 0), (8, 7, 1))
+    kept = ground[rng.uniform(size=len(ground)) < 0.9]
+    above = rng.integers((-1800, -1200, 0), (1600, 1400, 4500), (25, 3))
+    surfels = balls(np.concatenate([kept, above]))
+    np.testing.assert_array_equal(ghosts_among(surfels, EDGE), literal(surfels.centre_mm))
+
+
+def test_nothing_beyond_the_reach_shows() -> None:
+    surfels, _ = street()
+    x = surfels.centre_mm[:, 0]
+    middle = (x > 8_000) & (x < 14_000)
+    margin = REACH_EDGES * EDGE
+    crop = (x > 8_000 - margin) & (x < 14_000 + margin)
+    everywhere = ghosts_among(surfels, EDGE)
+    cut = np.zeros(len(surfels), np.bool_)
+    cut[crop] = ghosts_among(surfels.where(crop), EDGE)
+    assert everywhere[middle].any()
+    np.testing.assert_array_equal(cut[middle], everywhere[middle])
+    assert len(ghosts_among(surfels.where(np.zeros(len(surfels), np.bool_)), EDGE)) == 0

@@ -1,0 +1,74 @@
+"""Ghosts: what passed by while the map was made, and stands in it as if it were there.
+
+A parked car hides the ground beneath it in every pass of the survey; a moving one does not: where
+it was, the ground is in the map too. So what stands in the open on visible ground is a ghost. What
+is thin enough for ground to show all around it, a lamp post or a fence, may be taken for one.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tilestream.factors.surfels import Surfels
+
+LOW_MM, HIGH_MM = 300, 3_400
+"""Heights above the ground between which traffic stands [mm]."""
+BLOCK = 5
+"""Columns along the edge of the blocks in which the lowest surfel tells the ground: 1 m."""
+AROUND = 2
+"""Columns on each side that must show ground too: 5 x 5 in all."""
+OPEN = 0.7
+"""Share of these columns that must."""
+REACH_EDGES = 2 * BLOCK + AROUND
+"""How far around a surfel the map decides whether it is a ghost [edges]: 2.4 m."""
+NONE_MM = 2**30
+"""Height of nothing: above all ground [mm]."""
+
+Int32 = NDArray[np.int32]
+
+
+def ghosts_among(surfels: Surfels, edge_mm: int) -> NDArray[np.bool_]:
+    """Which surfels are ghosts.
+
+    A ghost stands 0.3 to 3.4 m above the ground, the lowest surfel of the blocks of 1 m around. Its
+    own column, of one voxel, and 70 % of the 5 x 5 around it show ground and nothing above 3.4 m.
+
+    Args:
+        surfels: those of a part of the map; what lies within `REACH_EDGES` of its rim is judged
+            from what is there.
+        edge_mm: edge of their voxels [mm].
+    """
+    if not len(surfels):
+        return np.zeros(0, np.bool_)
+    block_mm = BLOCK * edge_mm
+    corner = surfels.centre_mm[:, :2].min(axis=0) // block_mm * block_mm
+    column = (surfels.centre_mm[:, :2] - corner) // edge_mm
+    shape = (column.max(axis=0) // BLOCK + 1) * BLOCK
+    at = column[:, 0] * shape[1] + column[:, 1]
+    z = (surfels.centre_mm[:, 2] - surfels.centre_mm[:, 2].min()).astype(np.int32)
+    lowest, highest = (np.full(shape, none, np.int32) for none in (NONE_MM, -NONE_MM))
+    np.minimum.at(lowest.reshape(-1), at, z)
+    np.maximum.at(highest.reshape(-1), at, z)
+    ground = _ground(lowest)
+    shows = (lowest < NONE_MM) & (lowest <= ground + LOW_MM) & (highest <= ground + HIGH_MM)
+    is_open = shows & (_sum_around(shows) >= OPEN * (2 * AROUND + 1) ** 2)
+    height = z - ground.reshape(-1)[at]
+    found: NDArray[np.bool_] = (height > LOW_MM) & (height <= HIGH_MM) & is_open.reshape(-1)[at]
+    return found
+
+
+def _ground(lowest: Int32) -> Int32:
+    """Per column the lowest surfel of its block and the eight around it [mm]."""
+    rows, columns = lowest.shape[0] // BLOCK, lowest.shape[1] // BLOCK
+    blocks = lowest.reshape(rows, BLOCK, columns, BLOCK).min(axis=(1, 3))
+    padded = np.pad(blocks, 1, mode="edge")
+    near = [padded[i : i + rows, j : j + columns] for i in range(3) for j in range(3)]
+    return np.min(near, axis=0).repeat(BLOCK, axis=0).repeat(BLOCK, axis=1)
+
+
+def _sum_around(shows: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """How many of the columns around each, itself included, show ground."""
+    padded = np.pad(shows.astype(np.uint8), AROUND)
+    steps = range(2 * AROUND + 1)
+    rows, columns = shows.shape
+    in_rows = sum(padded[i : i + rows] for i in steps)
+    return np.asarray(sum(in_rows[:, j : j + columns] for j in steps), np.uint8)
