@@ -147,6 +147,7 @@ def test_the_plan_makes_what_choices_share_once(
     assert any(task.key.startswith("cells-2000-") for task in fine.tasks)  # the usual map's size
 
 
+@pytest.mark.slow
 def test_no_number_of_workers_shows_and_what_is_done_is_kept(
     street: Path, route: ts.Route, found: Comparison, tmp_path: Path
 ) -> None:

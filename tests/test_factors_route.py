@@ -112,7 +112,7 @@ def test_sample_points_lie_a_sensor_height_above_the_ground(
     )
 
 
-@pytest.mark.parametrize("tile_size", [10.0, 64.0])
+@pytest.mark.parametrize("tile_size", [pytest.param(10.0, marks=pytest.mark.slow), 64.0])
 def test_no_tiling_and_no_number_of_workers_shows(
     street: Path, route: ts.Route, table: pd.DataFrame, tmp_path: Path, tile_size: float
 ) -> None:

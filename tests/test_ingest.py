@@ -216,16 +216,17 @@ def test_a_killed_worker_is_made_up_for(
     assert tree_digest(url) == tree_digest(reference.url)
 
 
-@pytest.mark.parametrize("tiles_before_the_kill", [0, 5])
+@pytest.mark.parametrize("tiles_before_the_kill", [pytest.param(0, marks=pytest.mark.slow), 5])
 def test_a_killed_ingest_continues_to_the_same_bytes(
     clouds: list[Path], tmp_path: Path, tiles_before_the_kill: int
 ) -> None:
-    arguments = ["--tile-size", "4", "--map-leaf", "0.1"]
-    command = [sys.executable, "-m", "tilestream", "ingest", *map(str, clouds), *arguments]
     whole, broken = tmp_path / "whole.zarr", tmp_path / "broken.zarr"
-    subprocess.run([*command, "--store", str(whole)], check=True, capture_output=True)
+    ts.ingest(clouds, whole, tile_size=4.0, map_leaf=0.1)
+    arguments = [*map(str, clouds), "--tile-size", "4", "--map-leaf", "0.1", "--store", str(broken)]
     process = subprocess.Popen(
-        [*command, "--store", str(broken)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        [sys.executable, "-m", "tilestream", "ingest", *arguments],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
     )
     pattern = "fragments/*" if not tiles_before_the_kill else f"*/{POINTS}/zarr.json"
     end = time.monotonic() + 60.0
@@ -237,7 +238,7 @@ def test_a_killed_ingest_continues_to_the_same_bytes(
     process.wait()
     assert (broken / "fragments").exists()
     assert tree_digest(broken) != tree_digest(whole)
-    subprocess.run([*command, "--store", str(broken)], check=True, capture_output=True)
+    ts.ingest(clouds, broken, tile_size=4.0, map_leaf=0.1)
     assert tree_digest(broken) == tree_digest(whole)
 
 

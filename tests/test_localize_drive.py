@@ -269,6 +269,7 @@ def test_starts_split_over_tasks_give_the_same_tables(
         same_tables(tmp_path, plain[1])
 
 
+@pytest.mark.slow
 def test_dask_workers_give_the_same_tables(
     store: ts.TileStore, drive: Path, plain: tuple[pd.DataFrame, Path], tmp_path: Path
 ) -> None:
@@ -286,6 +287,7 @@ def test_dask_workers_give_the_same_tables(
 # --- Resumed, and redone
 
 
+@pytest.mark.slow
 def test_a_killed_run_continues_and_redoes_only_what_was_missing(
     store: ts.TileStore, drive: Path, tmp_path: Path
 ) -> None:

@@ -195,12 +195,14 @@ def test_a_second_run_redoes_nothing(inputs: Path, copy: Path) -> None:
     assert hashes(copy) == before
 
 
+@pytest.mark.slow
 def test_another_seed_redoes_the_models_only(inputs: Path, copy: Path) -> None:
     told = Told()
     ts.run(job(inputs, copy, model={"seed": 7}), watch=told)
     assert told.worked() == {"judge", "weigh", "train", "predict"}
 
 
+@pytest.mark.slow
 def test_another_matcher_redoes_the_labels_and_what_is_learnt(inputs: Path, copy: Path) -> None:
     told = Told()
     label = {"matcher": "autoware", "starts": {"radius": 0.4, "step": 0.2}}
@@ -209,6 +211,7 @@ def test_another_matcher_redoes_the_labels_and_what_is_learnt(inputs: Path, copy
     assert ts.dataset(copy).data_sets["canyon"]["registration"]["solver"] == "raw"
 
 
+@pytest.mark.slow
 def test_a_drive_that_is_left_out_leaves_nothing_behind(inputs: Path, copy: Path) -> None:
     drives = [{"log": str(inputs / f"{kind}.mcap")} for kind in ("canyon", "tunnel")]
     ts.run(job(inputs, copy, drives=drives))

@@ -238,6 +238,7 @@ def test_a_street_has_the_same_terms_as_plain_numpy(shared_data) -> None:
         assert np.array_equal(counts[c], plain_counts(mean, normal, only)[c])
 
 
+@pytest.mark.slow
 @interpreted.outer
 def test_the_kernels_say_the_same_without_the_compiler() -> None:
     chosen = "(plain_numpy or fewer_than_three or at_the_radius or identical) and not street"

@@ -464,6 +464,7 @@ for mode in ("direct1", "direct7", "autoware"):
 """
 
 
+@pytest.mark.slow
 def test_kernels_say_the_same_uncompiled() -> None:
     tests = str(Path(__file__).parent)
     told = []

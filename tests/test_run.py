@@ -246,6 +246,7 @@ def test_another_address_than_loopback_is_warned_of(caplog: pytest.LogCaptureFix
     assert "whoever reaches them can run code here" in caplog.text
 
 
+@pytest.mark.slow
 def test_workers_print_nothing(tmp_path: Path) -> None:
     script = tmp_path / "quiet.py"
     script.write_text(QUIET.format(tests=str(Path(__file__).parent)))

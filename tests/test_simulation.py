@@ -292,6 +292,7 @@ def test_the_paths_are_those_of_the_paper() -> None:
     assert len(long) >= 2
 
 
+@pytest.mark.slow
 def test_every_path_keeps_clear_of_every_building() -> None:
     found = read_footprints(DATA / "shinjuku_buildings.geojson.gz")
     for street in read_streets(DATA / "shinjuku_routes.geojson"):

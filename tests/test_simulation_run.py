@@ -120,6 +120,7 @@ def test_a_simulation_leaves_map_logs_and_records_and_nothing_else(made: Path) -
     assert sorted(files(made)) == sorted([*surveys, "logs/drive0/A.mcap", *RECORDS])
 
 
+@pytest.mark.slow
 def test_two_dask_workers_write_the_same_bytes(
     settings: SimulationSettings, made: Path, tmp_path: Path
 ) -> None:
