@@ -14,7 +14,7 @@ from mcap.writer import CompressionType, IndexType
 from scipy.spatial.transform import Rotation
 
 from tilestream.errors import PoseError, SourceError, UsageError
-from tilestream.formats.mcap import ScanSelection, looks_like_mcap, open_drive, open_log
+from tilestream.formats.mcap import ScanSelection, open_drive, open_log
 from tilestream.formats.mcap_file import McapFile
 from tilestream.formats.mcap_write import LogWriter, write_log
 from tilestream.formats.poses import PoseStatus
@@ -238,11 +238,6 @@ def test_a_drive_without_a_posed_scan_in_the_selection_is_refused(tmp_path: Path
     path = logs.street_log(tmp_path / "a.mcap")
     with pytest.raises(PoseError, match="none of its 12 scans"):
         open_drive(path, scans=ScanSelection(start=12))
-
-
-def test_the_first_bytes_tell() -> None:
-    assert looks_like_mcap(b"\x89MCAP0\r\n\x01")
-    assert not looks_like_mcap(b"# .PCD v0.7")
 
 
 # --- clouds of every layout

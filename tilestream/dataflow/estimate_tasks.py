@@ -102,22 +102,30 @@ class JoinTask:
         return "join-dataset"
 
 
-@dataclass(frozen=True)
-class JudgeTask:
-    """Let one competitor estimate what it has not seen, on every protocol."""
+@dataclass(frozen=True, kw_only=True)
+class _OnDataset:
+    """Something that is made of the joined dataset."""
 
     dataset: str
-    competitor: str
-    target: str
-    factor_set: str
-    """Name of the factors it may use (`evaluation.factor_sets`); empty: all."""
+    """Its file."""
     seed: int
+    """Of what is random in it."""
     out: str
     identity: str
     needs: tuple[str, ...] = ("join-dataset",)
     promised_bytes: int = BASE_BYTES + FOREST_BYTES
-    stage: str = "judge"
     work: int = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class JudgeTask(_OnDataset):
+    """Let one competitor estimate what it has not seen, on every protocol."""
+
+    competitor: str
+    target: str
+    factor_set: str
+    """Name of the factors it may use (`evaluation.factor_sets`); empty: all."""
+    stage: str = "judge"
 
     @property
     def key(self) -> str:
@@ -126,18 +134,11 @@ class JudgeTask:
         return name.replace(" ", "_")
 
 
-@dataclass(frozen=True)
-class WeighTask:
+@dataclass(frozen=True, kw_only=True)
+class WeighTask(_OnDataset):
     """How much each factor and each criterion matters."""
 
-    dataset: str
-    seed: int
-    out: str
-    identity: str
-    needs: tuple[str, ...] = ("join-dataset",)
-    promised_bytes: int = BASE_BYTES + FOREST_BYTES
     stage: str = "weigh"
-    work: int = 1
 
     @property
     def key(self) -> str:
@@ -145,19 +146,12 @@ class WeighTask:
         return "weigh-factors"
 
 
-@dataclass(frozen=True)
-class TrainTask:
+@dataclass(frozen=True, kw_only=True)
+class TrainTask(_OnDataset):
     """Train the model on all of the dataset."""
 
-    dataset: str
     recipe: str
-    seed: int
-    out: str
-    identity: str
-    needs: tuple[str, ...] = ("join-dataset",)
-    promised_bytes: int = BASE_BYTES + FOREST_BYTES
     stage: str = "train"
-    work: int = 1
 
     @property
     def key(self) -> str:

@@ -110,10 +110,11 @@ def run(
 ) -> Path:
     """The whole job: measure errors on drives, learn what the map says of them, estimate all.
 
-    Writes a run directory: `map.zarr/`, `tables/{factors,starts,errors,samples,judged,predictions}`
-    (Parquet with documented columns), `model.skops`, `report/` (`index.html` and its data),
-    `config.yaml` (the effective one), `run.json` (versions, times, counts, failures). A job that
-    was killed continues when it is called again; what changed is redone with what depends on it.
+    Writes a run directory: `map.zarr/`, `tables/` (Parquet with documented columns: `factors`,
+    `observability`, `starts`, `errors`, `samples`, `judged`, `predictions`), `model.skops`,
+    `report/` (`index.html` and its data), `config.yaml` (the effective one), `run.json` (versions,
+    times, counts, failures). A job that was killed continues when it is called again; what changed
+    is redone with what depends on it.
 
     Args:
         config: the settings, or a YAML file of them.

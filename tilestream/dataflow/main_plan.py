@@ -317,7 +317,15 @@ def plan_estimate(settings: RunSettings, measure: Plan, outcomes: Sequence[Outco
         if settings.model.use is None and settings.model.recipe != "physics":
             state = train_identity(identity, settings.model.recipe, settings.model.seed)
             seed = settings.model.seed
-            tasks.append(TrainTask(join.out, settings.model.recipe, seed, model, state))
+            tasks.append(
+                TrainTask(
+                    dataset=join.out,
+                    recipe=settings.model.recipe,
+                    seed=seed,
+                    out=model,
+                    identity=state,
+                )
+            )
             tasks += judges(join, f"{tables}/judged", seed, bool(observed))
     if settings.model.use is not None:
         if not Path(settings.model.use).is_file():
@@ -362,15 +370,22 @@ def judges(join: JoinTask, folder: str, seed: int, observed: bool) -> list[Task]
     ]
     tasks: list[Task] = [
         JudgeTask(
-            join.out,
-            competitor,
-            target,
-            factor_set,
-            seed,
-            f"{folder}/{target}-{competitor}-{factor_set or 'all'}.parquet".replace(" ", "_"),
-            hash_of(join.identity, target, competitor, factor_set, seed, TRAIN_VERSION, VERSION),
+            dataset=join.out,
+            competitor=competitor,
+            target=target,
+            factor_set=factor_set,
+            seed=seed,
+            out=f"{folder}/{target}-{competitor}-{factor_set or 'all'}.parquet".replace(" ", "_"),
+            identity=hash_of(
+                join.identity, target, competitor, factor_set, seed, TRAIN_VERSION, VERSION
+            ),
         )
         for target, competitor, factor_set in wanted
     ]
-    weigh = hash_of(join.identity, seed, TRAIN_VERSION, VERSION)
-    return [*tasks, WeighTask(join.out, seed, f"{folder}/weights.parquet", weigh)]
+    weigh = WeighTask(
+        dataset=join.out,
+        seed=seed,
+        out=f"{folder}/weights.parquet",
+        identity=hash_of(join.identity, seed, TRAIN_VERSION, VERSION),
+    )
+    return [*tasks, weigh]

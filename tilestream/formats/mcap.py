@@ -18,7 +18,7 @@ from tilestream.errors import CorruptSourceError, PoseError, SourceError, UsageE
 from tilestream.formats import ros2
 from tilestream.formats.base import Block, SourceInfo, Span
 from tilestream.formats.log_poses import POSE_TYPES, PoseTrack, choose_poses
-from tilestream.formats.mcap_file import MAGIC, McapFile, Message, Topic
+from tilestream.formats.mcap_file import McapFile, Message, Topic
 from tilestream.formats.poses import PoseStatus, interpolate, transform
 from tilestream.records import Float64, Int64, Scan, Trajectory
 
@@ -511,8 +511,3 @@ def open_drive(
     if not log.posed[scans.indices(log.stamps_ns)].any():
         raise PoseError(f"{path}: none of its {len(log)} scans that {scans} selects has a pose")
     return McapDrive(log, scans, range_max)
-
-
-def looks_like_mcap(head: bytes) -> bool:
-    """Whether the first bytes of a file are those of an MCAP file."""
-    return head.startswith(MAGIC)
