@@ -62,7 +62,8 @@ def _ground(lowest: Int32) -> Int32:
     blocks = lowest.reshape(rows, BLOCK, columns, BLOCK).min(axis=(1, 3))
     padded = np.pad(blocks, 1, mode="edge")
     near = [padded[i : i + rows, j : j + columns] for i in range(3) for j in range(3)]
-    return np.min(near, axis=0).repeat(BLOCK, axis=0).repeat(BLOCK, axis=1)
+    ground: Int32 = np.min(near, axis=0).repeat(BLOCK, axis=0).repeat(BLOCK, axis=1)
+    return ground
 
 
 def _sum_around(shows: NDArray[np.bool_]) -> NDArray[np.uint8]:
@@ -70,5 +71,10 @@ def _sum_around(shows: NDArray[np.bool_]) -> NDArray[np.uint8]:
     padded = np.pad(shows.astype(np.uint8), AROUND)
     steps = range(2 * AROUND + 1)
     rows, columns = shows.shape
-    in_rows = sum(padded[i : i + rows] for i in steps)
-    return np.asarray(sum(in_rows[:, j : j + columns] for j in steps), np.uint8)
+    in_rows = np.zeros((rows, columns + 2 * AROUND), np.uint8)
+    around = np.zeros_like(shows, np.uint8)
+    for i in steps:
+        in_rows += padded[i : i + rows]
+    for j in steps:
+        around += in_rows[:, j : j + columns]
+    return around

@@ -169,9 +169,9 @@ class _View:
                 yield from self.rows(places, turns, np.array([row]))
             return
         for block in blocks_of(places, some):
-            scenes = [self.scene(those, places[block]) for those in (surfels, ghosts)]
+            scene, passed = (self.scene(those, places[block]) for those in (surfels, ghosts))
             for row in block:
-                yield int(row), self.seen_from(*scenes, cells, places[row], turns[row])
+                yield int(row), self.seen_from(scene, passed, cells, places[row], turns[row])
 
     def around(self, places: Float64) -> tuple[Surfels, Surfels, Cells]:
         """What of the map can be seen from the places, the ghosts, and the cells around that."""
