@@ -1,0 +1,358 @@
+"""What the virtual drive costs, and how well it says where a real one errs.
+
+    python benchmarks/virtual_drive.py cost [--tiles 1,4,9]
+    python benchmarks/virtual_drive.py city RUN [--every 10] [--set without_ghosts=false]
+    python benchmarks/virtual_drive.py sensors RUN [--set ...]
+
+cost: CPU time of one core per sample point, on street tiles of a million points, VLP-16, 100 m, and
+per tile of larger cities. city: RUN is what `tilestream run pipelines/shinjuku.yaml` made; at every
+n-th sample point the virtual scan is held against the simulator's own scan, by range, and the
+virtual drive against the measured errors, beside two ceilings: the scans themselves from as few
+starts, and a repeated drive. sensors: RUN is what `tilestream run pipelines/drive.yaml` made; each
+lidar's own virtual drive is held against the errors measured as if with it. Nothing is written into
+RUN.
+"""
+
+import argparse
+import itertools
+import tempfile
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import yaml
+from scipy.stats import spearmanr
+from streets import TILE, Floats, long_street
+
+import tilestream as ts
+from tilestream.dataflow.along_routes import observe_along
+from tilestream.dataflow.run_settings import DriveSettings, RunSettings, read_settings
+from tilestream.factors.ghosts import ghosts_among
+from tilestream.factors.observability import (
+    box_around,
+    hessian_factors,
+    in_view,
+    observability,
+    whole_places,
+)
+from tilestream.factors.surfels import surfel_mm, surfels_in, tile_surfels
+from tilestream.factors.virtual_drive import physics_offset, stratified_starts, virtual_drive
+from tilestream.factors.virtual_scan import Beams, Scene, VirtualSettings, virtual_scan
+from tilestream.formats.mcap import open_log
+from tilestream.formats.pcd import write_pcd
+from tilestream.formats.routes import route_of
+from tilestream.kernels.virtual_scan import cast
+from tilestream.tiling import MM_PER_M
+
+BINS = (0.0, 5.0, 10.0, 20.0, 30.0, 50.0, 100.0)
+"""Ranges by which scans are compared [m]."""
+AGREE = 0.2
+"""Beams whose ranges differ by less agree [m]."""
+LOOKED_AT = 6
+"""Of so many sample points one has its beams compared."""
+PAIRS = {"mean": "error_mean", "tail": "error_tail", "floor": "error_floor", "p_fail": "p_fail"}
+MATCHERS = {
+    "definite": ts.RegistrationSettings(),
+    "autoware": ts.RegistrationSettings.autoware(),
+}
+
+
+def cpu_ms(work: Callable[[], Any], repeats: int = 7) -> float:
+    """The least CPU time of several runs [ms]; the first compiles and does not count."""
+    work()
+    found = []
+    for _ in range(repeats):
+        began = time.process_time()
+        work()
+        found.append(time.process_time() - began)
+    return 1000.0 * min(found)
+
+
+def show(title: str, rows: pd.DataFrame) -> None:
+    """Print a table as Markdown."""
+    print(f"\n### {title}\n")
+    lines = [list(rows.columns), ["---"] * rows.shape[1], *rows.astype(str).to_numpy().tolist()]
+    print("\n".join(f"| {' | '.join(line)} |" for line in lines), flush=True)
+
+
+# --- 1. Cost
+
+
+def street(folder: Path, tiles: int) -> ts.TileStore:
+    """A street of that many tiles of a million points."""
+    folder.mkdir(parents=True)
+    for number, points in enumerate(long_street(tiles, 0, 0.13)):
+        write_pcd(folder / f"{number:03}.pcd", points)
+    return ts.ingest([folder / "*.pcd"], folder / "map.zarr", tile_size=TILE)
+
+
+def cost(folder: Path) -> pd.DataFrame:
+    """What each step costs at a sample point in the middle of three tiles."""
+    store = street(folder, 3)
+    places = np.array([[1.5 * TILE + x, TILE / 2 + 0.5, 2.08] for x in range(-12, 13)])
+    place_mm, heading, seeing = whole_places(places[12]), 0.1, VirtualSettings()
+    key, edge_mm = store.grid.key_at(*places[12, :2]), surfel_mm(store)
+    beams = Beams.of(ts.VLP16, seeing)
+    surfels = surfels_in(store, box_around(places, 101.0))
+    cells = store.cells_in(box_around(places, 110.0), 2.0)
+
+    def scene() -> Scene:
+        near = in_view(surfels, places, ts.VLP16.fov_deg, 100.0)
+        return Scene.of(near, whole_places(places), edge_mm)
+
+    made = scene()
+    scan = virtual_scan(made, place_mm, heading, ts.VLP16, seeing, beams)
+    T_map_lidar = upright(place_mm, heading)
+    points = len(store.tile(key).points())
+    rows = [
+        ("surfels of a tile", f"{points:,} points", cpu_ms(lambda: tile_surfels(store, key), 2)),
+        (
+            "ghosts among the surfels",
+            f"{len(surfels):,}, once per tile",
+            cpu_ms(lambda: ghosts_among(surfels, edge_mm), 2),
+        ),
+        ("scene, per sample point", "25 share one", cpu_ms(scene, 3) / 25),
+        (
+            "scan",
+            f"{len(beams.direction)} beams, {len(scan.points)} returns",
+            cpu_ms(lambda: virtual_scan(made, place_mm, heading, ts.VLP16, seeing, beams)),
+        ),
+    ]
+    for name, settings in MATCHERS.items():
+        at = (cells, scan.points, T_map_lidar, settings)
+        rows.append(("Hessian", name, cpu_ms(partial(hessian_factors, *at), 4)))
+        for count in (32, 64, 317):
+            drive = partial(virtual_drive, *at, stratified_starts(count))
+            rows.append((f"{count} starts", name, cpu_ms(drive, 4)))
+    table = pd.DataFrame(rows, columns=["step", "of", "ms of one core"])
+    return table.round({"ms of one core": 1})
+
+
+def upright(place_mm: Any, heading: float) -> Floats:
+    """(4, 4) the pose of an upright lidar."""
+    c, s = np.cos(heading), np.sin(heading)
+    T_map_lidar = np.eye(4)
+    T_map_lidar[:2, :2] = [[c, -s], [s, c]]
+    T_map_lidar[:3, 3] = place_mm / MM_PER_M
+    return T_map_lidar
+
+
+def cost_of_cities(folder: Path, sizes: list[int]) -> pd.DataFrame:
+    """What a tile costs in larger and larger cities, everything together."""
+    rows = []
+    for tiles in sizes:
+        store = street(folder / str(tiles), tiles)
+        ends = np.array([[0.5, TILE / 2 + 0.5, 0.08], [tiles * TILE - 0.5, TILE / 2 + 0.5, 0.08]])
+        route = route_of("street", ends)
+        began = time.process_time()
+        found = observe_along(store, [route], folder / str(tiles) / "out", spacing=5.0)
+        seconds = time.process_time() - began
+        done = (found["status"] == "done").sum()
+        rows.append((tiles, f"{done} of {len(found)}", round(seconds / tiles, 2)))
+    return pd.DataFrame(rows, columns=["tiles", "sample points done", "CPU s per tile"])
+
+
+# --- 2. A simulated city
+
+
+def errors_of(run: Path, group: str) -> pd.DataFrame:
+    """The measured errors of a drive, by sample point; those that are done."""
+    parts = [pd.read_parquet(path) for path in sorted((run / "tables/errors" / group).iterdir())]
+    table = pd.concat(parts)
+    return table[table["status"] == "done"].set_index("sample", drop=False).sort_index()
+
+
+def city(run: Path, every: int, changes: dict[str, Any]) -> None:
+    """Virtual scans and drives of a simulated city against those that the simulator made."""
+    settings = read_settings(run / "config.yaml")
+    assert settings.simulate is not None
+    assert settings.observe is not None
+    seeing = VirtualSettings(**(settings.observe.model_dump() | changes))
+    store, logs = ts.open_store(str(run / "map.zarr")), Path(settings.simulate.folder) / "logs"
+    tables, ranges, spent = [], [], 0.0
+    for group in sorted(path.name for path in (run / "tables/errors").glob("drive0-*")):
+        labels = errors_of(run, group)
+        labels = labels[labels["sample"] % every == 0]
+        places, headings = labels[["x", "y", "z"]].to_numpy(), labels["heading"].to_numpy()
+        how = (settings.looking_sensor, seeing, settings.label.registration)
+        began = time.process_time()
+        found = observability(store, places, headings, *how)
+        spent += time.process_time() - began
+        log = logs / "drive0" / f"{group.removeprefix('drive0-')}.mcap"
+        few = themselves(store, log, labels, seeing, settings)
+        ranges += [compared(store, log, labels[::LOOKED_AT], seeing, settings)]
+        again = errors_of(run, group.replace("drive0", "drive1")).reindex(labels.index)
+        tables.append(
+            labels[list(PAIRS.values())]
+            .reset_index(drop=True)
+            .join(found.filter(regex="^vd_"))
+            .join(few.add_prefix("few_"))
+            .join(again[list(PAIRS.values())].reset_index(drop=True).add_prefix("again_"))
+            .assign(path=group)
+        )
+    table = pd.concat(tables, ignore_index=True)
+    print(f"{len(table)} sample points, {1000.0 * spent / len(table):.0f} ms of one core each")
+    show("Beams of the simulator's scans, cast in the map", agreement(np.concatenate(ranges)))
+    estimates = {
+        "virtual drive": {name: f"vd_{name}" for name in PAIRS},
+        f"its own scan, {seeing.starts} starts": {name: f"few_vd_{name}" for name in PAIRS},
+        "a repeated drive": {name: f"again_{label}" for name, label in PAIRS.items()},
+    }
+    show("Against the measured errors", against(table, estimates))
+
+
+def themselves(
+    store: ts.TileStore,
+    log: Path,
+    labels: pd.DataFrame,
+    seeing: VirtualSettings,
+    settings: RunSettings,
+) -> pd.DataFrame:
+    """The columns of the virtual drive from the scans themselves."""
+    starts = stratified_starts(seeing.starts)
+    rows = []
+    for scan in open_log(str(log)).scans_at(labels["scan"].tolist()):
+        assert scan.T_map_lidar is not None
+        box = box_around(scan.T_map_lidar[None, :3, 3], settings.looking_sensor.range_max + 10.0)
+        cells = store.cells_in(box, settings.cell_size)
+        how = (settings.label.registration, starts)
+        rows.append(virtual_drive(cells, scan.points, scan.T_map_lidar, *how))
+    return pd.DataFrame(rows)
+
+
+def compared(
+    store: ts.TileStore,
+    log: Path,
+    labels: pd.DataFrame,
+    seeing: VirtualSettings,
+    settings: RunSettings,
+) -> Floats:
+    """(n, 2) true and virtual range along the beams that came back in the scans [m]."""
+    reach, edge_mm = Beams.of(settings.looking_sensor, seeing).range_max, surfel_mm(store)
+    found = []
+    for scan in open_log(str(log)).scans_at(labels["scan"].tolist()):
+        assert scan.T_map_lidar is not None
+        place = scan.T_map_lidar[:3, 3]
+        at, near = whole_places(place), seeing.range_min * MM_PER_M
+        surfels = surfels_in(store, box_around(place[None], reach + 4.0))
+        if seeing.without_ghosts:
+            surfels = surfels.where(~ghosts_among(surfels, edge_mm))
+        scene = Scene.of(surfels, at[None], edge_mm)
+        true = np.linalg.norm(scan.points, axis=1)
+        beams = np.ascontiguousarray(scan.points / true[:, None] @ scan.T_map_lidar[:3, :3].T)
+        met, cosine = np.empty(len(true)), np.empty(len(true))
+        cast(scene.bricks, at, beams, near, reach * MM_PER_M, met, cosine)
+        found.append(np.column_stack([true, met]))
+    return np.concatenate(found)
+
+
+def agreement(ranges: Floats) -> pd.DataFrame:
+    """Share of beams whose virtual range is right, too short, too long, missing."""
+    true, met = ranges.T
+    rows = []
+    for low, high in [*itertools.pairwise(BINS), (BINS[0], BINS[-1])]:
+        some = (true >= low) & (true < high)
+        if some.any():
+            off = met[some] - true[some]
+            shares = [np.abs(off) < AGREE, off <= -AGREE, (off >= AGREE) & np.isfinite(off)]
+            texts = [f"{share.mean():.1%}" for share in (*shares, np.isinf(off))]
+            rows.append((f"{low:g}-{high:g} m", some.sum(), *texts))
+    names = ["range", "beams", "within 0.2 m", "too short", "too long", "no return"]
+    return pd.DataFrame(rows, columns=names)
+
+
+def against(table: pd.DataFrame, estimates: dict[str, dict[str, str]]) -> pd.DataFrame:
+    """How estimates rank and meet the labels; the offset is fitted on the other paths.
+
+    skill = 1 - MAE / MAE of the median of the other paths.
+    """
+    rows = []
+    for title, columns in estimates.items():
+        for name, column in columns.items():
+            both = table[[column, PAIRS[name], "path"]].dropna()
+            x, y = both[column].to_numpy(), both[PAIRS[name]].to_numpy()
+            fitted, median = np.empty(len(x)), np.empty(len(x))
+            for path in both["path"].unique():
+                here = (both["path"] == path).to_numpy()
+                fitted[here] = x[here] + physics_offset(x[~here], y[~here])
+                median[here] = np.median(y[~here])
+            skill = 1.0 - np.abs(fitted - y).mean() / np.abs(median - y).mean()
+            figures = (f"{spearmanr(x, y)[0]:.2f}", f"{skill:.2f}")
+            rows.append(
+                (title, PAIRS[name], len(x), *figures, f"{x.mean():.3f}", f"{y.mean():.3f}")
+            )
+    names = ["estimate", "of", "points", "Spearman", "skill", "its mean", "measured"]
+    return pd.DataFrame(rows, columns=names)
+
+
+# --- 3. The real drive, over sensors
+
+
+def lesser(drive: DriveSettings) -> tuple[ts.Sensor, dict[str, Any]]:
+    """The HDL-64E of the drive as the run thinned it, and how the vehicle sees with it."""
+    full = np.array(ts.HDL64.elevations_deg)
+    kept = full if drive.beams is None else np.linspace(full[0], full[-1], drive.beams)
+    sensor = ts.HDL64.model_copy(update={"elevations_deg": tuple(kept.tolist())})
+    return sensor, {
+        "range_max": drive.range_max or 80.0,
+        "blind_rear_deg": drive.blind_rear_deg or 0.0,
+    }
+
+
+def sensors(run: Path, changes: dict[str, Any]) -> None:
+    """The virtual drive of each sensor beside what was measured as if with it."""
+    settings = read_settings(run / "config.yaml")
+    store = ts.open_store(str(run / "map.zarr"))
+    rows, scans = [], []
+    for drive in settings.drives:
+        labels = errors_of(run, drive.group)
+        places, headings = labels[["x", "y", "z"]].to_numpy(), labels["heading"].to_numpy()
+        sensor, seen = lesser(drive)
+        seeing = VirtualSettings(**(seen | changes))
+        found = observability(store, places, headings, sensor, seeing, settings.label.registration)
+        done = (found["status"] == "done").to_numpy()
+        y, x = labels["error_mean"].to_numpy()[done], found["vd_mean"].to_numpy()[done]
+        scans.append(pd.DataFrame({"scan": labels["scan"].to_numpy()[done], "x": x, "y": y}))
+        means = [f"{100 * value:.1f}" for value in (y.mean(), x.mean())]
+        rows.append((drive.group, len(y), *means, f"{spearmanr(x, y)[0]:.2f}", (~done).sum()))
+    names = ["sensor", "scans", "measured [cm]", "virtual [cm]", "Spearman", "not done"]
+    show("Over sensors", pd.DataFrame(rows, columns=names))
+    together = pd.concat(scans)
+    same = together.groupby("scan").filter(lambda rows: len(rows) == len(settings.drives))
+    order = np.array([spearmanr(g["x"], g["y"])[0] for _, g in same.groupby("scan")])
+    print(
+        f"\nall {len(together)} scans: Spearman {spearmanr(together['x'], together['y'])[0]:.2f}; "
+        f"order of the sensors at {len(order)} places: mean Spearman {order.mean():.2f}, "
+        f"right at {(order > 0.999).sum()}"
+    )
+
+
+def main() -> None:
+    """Measure what is asked for."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("part", choices=["cost", "city", "sensors"])
+    parser.add_argument("run", type=Path, nargs="?", help="a finished run directory")
+    parser.add_argument("--tiles", default="1,4,9")
+    parser.add_argument("--every", type=int, default=10)
+    parser.add_argument("--set", action="append", default=[], help="a setting of the virtual drive")
+    given = parser.parse_args()
+    changes = {key: yaml.safe_load(value) for key, value in (s.split("=", 1) for s in given.set)}
+    if given.part != "cost" and given.run is None:
+        parser.error("give a finished run directory")
+    if given.part == "city":
+        city(given.run, given.every, changes)
+    elif given.part == "sensors":
+        sensors(given.run, changes)
+    else:
+        with tempfile.TemporaryDirectory() as scratch:
+            show("Per sample point", cost(Path(scratch) / "street"))
+            sizes = [int(size) for size in given.tiles.split(",")]
+            show("Per tile", cost_of_cities(Path(scratch) / "city", sizes))
+
+
+if __name__ == "__main__":
+    main()
