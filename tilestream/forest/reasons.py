@@ -57,6 +57,8 @@ UNSEEN = "few beams would come back"
 SEEN = "beams come back from everywhere"
 UNMAPPED = "much of the view is not in the map"
 MAPPED = "all of the view is in the map"
+TRAFFIC = "traffic baked into the map stands in view"
+EMPTY = "no traffic baked into the map"
 
 PHRASES: dict[str, tuple[str, str]] = {
     "feature_count": (FEW, CROWDED),
@@ -113,6 +115,7 @@ PHRASES: dict[str, tuple[str, str]] = {
     "ob_cells": (FEW, CROWDED),
     "ob_returns": (UNSEEN, SEEN),
     "ob_unmapped": (MAPPED, UNMAPPED),
+    "ob_ghosts": (EMPTY, TRAFFIC),
     "vd_mean": (HOLDS, DRIFTS),
     "vd_floor": (HOLDS, DRIFTS),
     "vd_tail": (HOLDS, LOST),
