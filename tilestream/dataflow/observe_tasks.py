@@ -31,8 +31,9 @@ OBSERVE_VERSION = 2
 """Raise it when what is observed from the same surfels and cells changes."""
 SURFELS_BYTES = 400_000_000
 """Memory of a surfels task beyond the interpreter: the points of a tile, some of their planes."""
-OBSERVE_BYTES = 650_000_000
-"""Memory of an observe task beyond the interpreter: surfels and cells in sight, and a scene."""
+OBSERVE_BYTES = 1_000_000_000
+"""Memory of an observe task beyond the interpreter: surfels and cells in sight, a scene, and the
+terms that factors tasks keep in the same process."""
 
 
 @dataclass(frozen=True)
