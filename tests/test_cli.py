@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 import tilestream as ts
 from tilestream.cli import run
+from tilestream.cli.app import COMMANDS, command_of
 from tilestream.cli.options import parse_bytes
 from tilestream.dataflow.run import TlsFiles
 from tilestream.errors import UsageError
@@ -94,6 +95,19 @@ def test_help_names_every_command(capsys: Told) -> None:
         assert "Usage" in capsys.readouterr().out
     assert run(["ingest", "--help"]) == 0
     assert "Edge of a tile [m]." in capsys.readouterr().out
+
+
+def test_the_list_of_commands_says_what_each_says_of_itself() -> None:
+    for name, (_, told) in COMMANDS.items():
+        assert command_of(name).help == told
+
+
+def test_the_list_of_commands_comes_without_what_they_need() -> None:
+    heavy = "{'sklearn', 'bokeh', 'matplotlib'} & set(sys.modules)"
+    code = f"import sys; from tilestream.cli import run; run(['--help']); sys.exit(bool({heavy}))"
+    listed = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
+    assert listed.returncode == 0
+    assert all(name in listed.stdout.decode() for name in COMMANDS)
 
 
 def test_version_is_that_of_the_package(capsys: Told) -> None:

@@ -22,9 +22,19 @@ from tilestream.dataflow import estimate_tasks, main_job
 from tilestream.dataflow.calibration import calibration_file, core_hours, learn
 from tilestream.dataflow.main_forecast import forecast
 from tilestream.dataflow.run import dask_client
-from tilestream.dataflow.run_settings import RunSettings, read_settings
+from tilestream.dataflow.run_settings import (
+    DriveSettings,
+    LabelSettings,
+    MapSettings,
+    ModelSettings,
+    ReportSettings,
+    RunSettings,
+    SimulateSettings,
+    read_settings,
+)
 from tilestream.dataflow.tasks import Outcome
 from tilestream.errors import ModelError, PartialError, SourceNotFoundError, UsageError
+from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.forest import evaluation, models, training
 from tilestream.forest.models import Recipe
 from tilestream.forest.training import PREDICTION_COLUMNS
@@ -392,6 +402,20 @@ def test_changes_come_on_top_of_the_file(tmp_path: Path) -> None:
         read_settings(tmp_path / "job.yaml", ["spacing"])
     with pytest.raises(UsageError, match="out holds a value"):
         read_settings(tmp_path / "job.yaml", ["out.x=1"])
+
+
+def test_the_template_is_a_job_and_explains_every_setting(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command(["template"]) == 0
+    text = capsys.readouterr().out
+    (tmp_path / "job.yaml").write_text(text)
+    assert read_settings(tmp_path / "job.yaml").out == "my-city"
+    groups = [RunSettings, SimulateSettings, MapSettings, DriveSettings, VirtualSettings]
+    groups += [LabelSettings, ModelSettings, ReportSettings]
+    settings = {name for group in groups for name in group.model_fields}
+    explained = set(re.findall(r"^[ #-]*\{?(\w+):", text, flags=re.MULTILINE))
+    assert explained == settings
 
 
 def test_a_log_that_is_not_there_is_named(inputs: Path, tmp_path: Path) -> None:

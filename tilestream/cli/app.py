@@ -6,12 +6,13 @@ Exit codes: 0 all good; 1 some sources, tiles or scans failed and are listed, th
 
 import logging
 import sys
-from typing import Annotated
+from importlib import import_module
+from typing import Annotated, Any
 
 import typer
 from rich.logging import RichHandler
+from typer.core import TyperGroup
 
-from tilestream.cli import jobs, maps, routes
 from tilestream.cli.printing import err, out, say
 from tilestream.errors import (
     PlanError,
@@ -22,27 +23,72 @@ from tilestream.errors import (
 )
 from tilestream.version import VERSION
 
+MARKUP: Any = "markdown"  # the other mode takes [m] for a style
+COMMANDS = {
+    "ingest": ("maps", "Make a tile store from point clouds, map directories and logs of drives."),
+    "status": ("maps", "Show the tiles of a store: counts, extents, status and reasons."),
+    "info": ("maps", "Show what is in a file or log: points, bounds, fields, topics, CRS."),
+    "localize": (
+        "routes",
+        "Measure the localization error along a drive: 317 registrations per sample point.",
+    ),
+    "factors": ("routes", "Compute the factors of the map at every sample point of a route."),
+    "compare": (
+        "routes",
+        "Compare lidars, ranges and map resolutions along routes, from the map alone.",
+    ),
+    "simulate": (
+        "jobs",
+        "Simulate a survey of Shinjuku and drives through it; a killed run continues.",
+    ),
+    "template": ("jobs", "Print a job for your city: a YAML file that explains every setting."),
+    "run": (
+        "jobs",
+        "The main job: from map and drives to the estimated error everywhere, and its report.",
+    ),
+    "plan": (
+        "jobs",
+        "What a job would run: stages, tasks, memory, core-hours; reads headers, writes nothing.",
+    ),
+    "diff": (
+        "maps",
+        "What a map update changes: tiles, and sample points whose estimate got worse.",
+    ),
+    "demo": (
+        "jobs",
+        "The main job on a few streets of Shinjuku, simulated first: needs minutes and no files.",
+    ),
+}
+"""The file of each command, and what the list of commands says of it."""
+
+
+class LateCommands(TyperGroup):
+    """A group that imports a command's file when that command is to run, and no other."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
+        """The command of a line."""
+        name, command, rest = super().resolve_command(ctx, args)
+        return name, command and command_of(str(name)), rest
+
+
+def command_of(name: str) -> Any:
+    """A command with all its options."""
+    file, _ = COMMANDS[name]
+    alone = typer.Typer(add_completion=False, rich_markup_mode=MARKUP)
+    alone.command(name)(getattr(import_module(f"tilestream.cli.{file}"), name))
+    return typer.main.get_command(alone)
+
+
 app = typer.Typer(
     name="tilestream",
+    cls=LateCommands,
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    rich_markup_mode="markdown",  # the other mode takes [m] for a style
+    rich_markup_mode=MARKUP,
 )
-for command in (
-    maps.ingest,
-    maps.status,
-    maps.info,
-    routes.localize,
-    routes.factors,
-    routes.compare,
-    jobs.simulate,
-    jobs.run,
-    jobs.plan,
-    maps.diff,
-    jobs.demo,
-):
-    app.command()(command)
+for _name, (_, _told) in COMMANDS.items():
+    app.command(_name, help=_told)(lambda: None)  # only listed
 
 
 @app.callback(invoke_without_command=True)

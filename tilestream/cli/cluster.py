@@ -2,15 +2,17 @@
 
 import functools
 import inspect
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from tilestream.cli.printing import err, say
 from tilestream.dataflow.run import LOOPBACK, TlsFiles, dask_client
+from tilestream.dataflow.telling import page_url
 from tilestream.errors import UsageError
 
 WORKERS = "Worker processes on this machine; 1: this process does all."
@@ -31,9 +33,19 @@ class Cluster:
     tls: TlsFiles | None = None
     """Certificates; None: as Dask's own configuration says."""
 
-    def client(self, memory: int) -> AbstractContextManager[Any | None]:
-        """A client for tasks that use at most so much memory [bytes]; errors as `dask_client`."""
-        return dask_client(self.scheduler, self.workers, memory, host=self.host, tls=self.tls)
+    @contextmanager
+    def client(self, memory: int) -> Iterator[Any | None]:
+        """A client for tasks that use at most so much memory [bytes]; errors as `dask_client`.
+
+        Says on stderr where to watch them.
+        """
+        with dask_client(
+            self.scheduler, self.workers, memory, host=self.host, tls=self.tls
+        ) as client:
+            page = page_url(client)
+            if page is not None:
+                say(f"Watch it at {page}", to=err)
+            yield client
 
 
 HERE, ALL_CORES = Cluster(workers=1), Cluster()

@@ -10,17 +10,23 @@ import typer
 
 from tilestream.cli.cluster import ALL_CORES, HERE, AllCores, Cluster, on_cluster
 from tilestream.cli.options import AsJson, Changes, Config, DryRun
-from tilestream.cli.printing import err, out, print_json, say
+from tilestream.cli.printing import out, print_json, say
 from tilestream.cli.progress import progress
 from tilestream.cli.tables import forecast_rows, forecast_table, plan_table, report_table
 from tilestream.dataflow import main_job
 from tilestream.dataflow import simulate as simulation
 from tilestream.dataflow.main_forecast import forecast
 from tilestream.dataflow.run_settings import RunSettings, read_settings
-from tilestream.dataflow.telling import page_url
 from tilestream.errors import LimitError
 from tilestream.report import exceeds
 from tilestream.simulation.settings import load_preset
+
+SHIPPED = resources.files("tilestream") / "data"
+
+
+def template() -> None:
+    """Print a job for your city: a YAML file that explains every setting."""
+    out.out((SHIPPED / "city.yaml").read_text(), end="", highlight=False)
 
 
 @on_cluster
@@ -50,8 +56,6 @@ def run(
 def do_job(settings: RunSettings, cluster: Cluster) -> Path:
     """Run the main job with progress; the run directory."""
     with cluster.client(settings.memory) as client, progress() as watch:
-        if client is not None:
-            say(f"Watch it at {page_url(client)}", to=err)
         return main_job.run(settings, client, watch)
 
 
@@ -137,7 +141,7 @@ def demo(
     folder: Annotated[str, typer.Option("--out", help="The run directory.")] = "tilestream-demo",
     workers: AllCores = None,
 ) -> None:
-    """The main job on a few streets of Shinjuku, simulated first: some minutes, no files needed."""
-    with resources.as_file(resources.files("tilestream") / "data" / "demo.yaml") as path:
+    """The main job on a few streets of Shinjuku, simulated first: needs minutes and no files."""
+    with resources.as_file(SHIPPED / "demo.yaml") as path:
         settings = read_settings(path, [f"out={json.dumps(folder)}"])
     show_report(do_job(settings, Cluster(workers=workers)))

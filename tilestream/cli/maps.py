@@ -48,7 +48,7 @@ def ingest(
     offset: Offset = 0,
     from_s: FromS = 0.0,
     until_s: UntilS = None,
-    memory: Memory = "1GB",
+    memory: Memory = "1.5GB",
     dry_run: DryRun = False,
     cluster: Cluster = HERE,
 ) -> None:

@@ -38,7 +38,7 @@ ProjectTo = Annotated[str | None, typer.Option(help="CRS for routes in degrees."
 Spacing = Annotated[float, typer.Option(help="Distance between sample points [m].")]
 SensorHeight = Annotated[float, typer.Option(help="Of the lidar above the road [m].")]
 CellSize = Annotated[float, typer.Option(help="Edge of an NDT cell [m].")]
-Config = Annotated[str, typer.Argument(help="A YAML file; pipelines/city.yaml explains it.")]
+Config = Annotated[str, typer.Argument(help="A YAML file, begun with `tilestream template`.")]
 Changes = Annotated[
     list[str], typer.Option("--set", help="key=value over the file, e.g. model.seed=1.")
 ]

@@ -85,7 +85,7 @@ def localize(
     starts_per_task: Annotated[
         int | None, typer.Option(help="Split the starts; default: no.")
     ] = None,
-    memory: Memory = "1GB",
+    memory: Memory = "1.5GB",
     dry_run: DryRun = False,
     as_json: AsJson = False,
     cluster: Cluster = HERE,
@@ -136,7 +136,7 @@ def factors(
     cell_size: CellSize = 2.0,
     which: Annotated[Which, typer.Option(help="The paper's 20, their robust twins.")] = "all",
     project_to: ProjectTo = None,
-    memory: Memory = "1GB",
+    memory: Memory = "1.5GB",
     dry_run: DryRun = False,
     as_json: AsJson = False,
     cluster: Cluster = HERE,
@@ -202,7 +202,7 @@ def compare(
     threshold: Annotated[float, typer.Option(help="Estimates above are too large [m].")] = 0.25,
     sensor_height: SensorHeight = 2.0,
     project_to: ProjectTo = None,
-    memory: Memory = "1GB",
+    memory: Memory = "1.5GB",
     dry_run: DryRun = False,
     as_json: AsJson = False,
     cluster: Cluster = HERE,

@@ -419,6 +419,7 @@ def dask_client(
     security = None if tls is None else tls.security()
     count = CPU_COUNT if workers is None else workers
     if scheduler is not None:
+        logger.info("connecting to %s", scheduler)
         with silence_logging_cmgr(logging.CRITICAL), _connected(scheduler, security) as client:
             yield client
     elif count > 1:
@@ -429,6 +430,7 @@ def dask_client(
                 host,
                 risk if tls is None else "watch the run, though only certificates let them act",
             )
+        logger.info("starting %d workers", count)
         with (
             distributed.LocalCluster(
                 n_workers=count,

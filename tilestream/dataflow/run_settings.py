@@ -221,7 +221,7 @@ def read_settings(path: str | os.PathLike[str], changes: Sequence[str] = ()) -> 
     """
     place = Path(path)
     if not place.is_file():
-        raise SourceNotFoundError(f"{place}: no such config; pipelines/city.yaml is a template")
+        raise SourceNotFoundError(f"{place}: no such config; `tilestream template` prints one")
     try:
         values = yaml.safe_load(place.read_text())
     except (yaml.YAMLError, UnicodeDecodeError) as error:
