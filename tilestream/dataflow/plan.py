@@ -9,7 +9,7 @@ from tilestream.errors import PlanError
 BASE_BYTES = 350_000_000
 """Memory of a worker process before its first task: Python, NumPy, Numba, Zarr, Dask (measured
 by benchmarks/ingest.py)."""
-DEFAULT_MEMORY = 1_000_000_000
+DEFAULT_MEMORY = 1_500_000_000
 """What a task may use where the user promises nothing else [bytes]."""
 
 
