@@ -1,5 +1,6 @@
 """The commands: what they print, what they exit with, one clear line for each error."""
 
+import io
 import json
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from elsewhere import certificates, scheduler_elsewhere
 from logs import START, pose
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from rich.console import Console
 from scenes import PLACES, in_map
 from scipy.spatial.transform import Rotation
 
@@ -21,7 +23,9 @@ import tilestream as ts
 from tilestream.cli import run
 from tilestream.cli.app import COMMANDS, command_of
 from tilestream.cli.options import parse_bytes
+from tilestream.cli.progress import progress
 from tilestream.dataflow.run import TlsFiles
+from tilestream.dataflow.tasks import Outcome
 from tilestream.errors import UsageError
 from tilestream.formats.las import write_las
 from tilestream.formats.mcap import open_log
@@ -108,6 +112,32 @@ def test_the_list_of_commands_comes_without_what_they_need() -> None:
     listed = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
     assert listed.returncode == 0
     assert all(name in listed.stdout.decode() for name in COMMANDS)
+
+
+def test_without_a_terminal_progress_is_a_line_now_and_then(
+    monkeypatch: pytest.MonkeyPatch, capsys: Told
+) -> None:
+    clock = iter([0.0, 1.0, 31.0, 31.0, 50.0, 62.0, 62.0])
+    monkeypatch.setattr("tilestream.cli.progress.time.monotonic", lambda: next(clock))
+    with progress() as watch:
+        for stage, ended in (("merge", 1), ("cells", 1), ("cells", 2), ("cells", 3)):
+            watch(Outcome(f"{stage}-{ended}", stage, 0, ""), ended, 3)
+    assert capsys.readouterr().err == "merge 1/3, cells 1/3\ncells 3/3\n"
+
+
+def test_on_a_terminal_progress_shows_at_once_that_it_lives(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    screen = Console(file=io.StringIO(), force_terminal=True, width=100)
+    monkeypatch.setattr("tilestream.cli.progress.err", screen)
+    with progress() as watch:
+        began = screen.file.getvalue()
+        watch(Outcome("merge-1", "merge", None, "no space left"), 1, 2)
+    assert "starting" in began
+    shown = screen.file.getvalue()
+    assert "merge-1: no space left" in shown
+    assert "starting" not in shown.split("no space left")[1]
+    assert "1/2" in shown
 
 
 def test_version_is_that_of_the_package(capsys: Told) -> None:

@@ -440,7 +440,8 @@ def test_the_command_prints_the_headline_and_gates(
     assert command(["run", str(config), "--workers", "1"]) == 0
     said = capsys.readouterr().out
     assert "The report is at" in said
-    assert re.search(r"places\s+78", said)
+    assert "of road, 78 sample points" in said
+    assert re.search(r" cm +median estimated error", said)
     assert command(["run", str(config), "--workers", "1", "--fail-over", "1e-6"]) == 1
     assert "78 of 78 sample points are estimated above 1e-06 m" in capsys.readouterr().err
     assert command(["run", str(config), "--workers", "1", "--fail-over", "99"]) == 0

@@ -18,7 +18,7 @@ from tilestream.dataflow import simulate as simulation
 from tilestream.dataflow.main_forecast import forecast
 from tilestream.dataflow.run_settings import RunSettings, read_settings
 from tilestream.errors import LimitError
-from tilestream.report import exceeds
+from tilestream.report import cards, exceeds
 from tilestream.simulation.settings import load_preset
 
 SHIPPED = resources.files("tilestream") / "data"
@@ -67,7 +67,8 @@ def report_of(folder: Path) -> dict[str, Any]:
 
 def show_report(folder: Path) -> None:
     """Print the headline of a report and where it is."""
-    out.print(report_table(report_of(folder)))
+    report = report_of(folder)
+    out.print(report_table(report, cards(report)))
     say(f"The report is at {(folder / 'report' / 'index.html').absolute()}")
 
 

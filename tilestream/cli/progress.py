@@ -1,7 +1,8 @@
-"""Progress on stderr while a job runs: a bar per stage, and failures as they happen."""
+"""Progress on stderr while a job runs: bars on a terminal, else a line now and then."""
 
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import rich.progress
@@ -10,15 +11,21 @@ from rich.progress import (
     MofNCompleteColumn,
     Progress,
     ProgressColumn,
+    SpinnerColumn,
     TaskID,
     TextColumn,
     TimeRemainingColumn,
 )
 from rich.text import Text
 
-from tilestream.cli.printing import err
+from tilestream.cli.printing import err, say
 from tilestream.dataflow.run import Watch
 from tilestream.dataflow.tasks import Outcome
+
+LINE_EVERY = 30.0
+"""How often progress is told where there is no terminal, as in the log of a cluster job [s]."""
+Show = Callable[[str, int, int], None]
+"""Is called with a stage, how much of it has ended, and how much that is in all."""
 
 
 class Rate(ProgressColumn):
@@ -32,24 +39,58 @@ class Rate(ProgressColumn):
 
 @contextmanager
 def progress() -> Iterator[Watch]:
-    """A progress bar per stage on stderr; failures are printed as they happen."""
+    """Progress of each stage on stderr; failures are printed as they happen."""
+    with _bars() if err.is_terminal else _lines() as show:
+
+        def watch(outcome: Outcome, ended: int, total: int) -> None:
+            show(outcome.stage, ended, total)
+            if not outcome.ok:
+                err.print("failed", style="red", end="")
+                told = outcome.details if "--debug" in sys.argv else outcome.reason
+                err.print(f" {outcome.key}: {told or outcome.reason}", highlight=False)
+
+        yield watch
+
+
+@contextmanager
+def _bars() -> Iterator[Show]:
+    """A bar per stage, and one that moves until the first task has ended."""
     columns = (
+        SpinnerColumn(finished_text=" "),
         TextColumn("{task.description:>8}"),
         BarColumn(),
         MofNCompleteColumn(),
         Rate(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=err, transient=not err.is_terminal) as bar:
+    with Progress(*columns, console=err) as bar:
+        waiting = bar.add_task("starting", total=None)
         rows: dict[str, TaskID] = {}
 
-        def watch(outcome: Outcome, ended: int, total: int) -> None:
-            if outcome.stage not in rows:
-                rows[outcome.stage] = bar.add_task(outcome.stage, total=total)
-            bar.update(rows[outcome.stage], completed=ended, total=total)
-            if not outcome.ok:
-                bar.console.print("failed", style="red", end="")
-                told = outcome.details if "--debug" in sys.argv else outcome.reason
-                bar.console.print(f" {outcome.key}: {told or outcome.reason}", highlight=False)
+        def show(stage: str, ended: int, total: int) -> None:
+            bar.update(waiting, visible=False)
+            if stage not in rows:
+                rows[stage] = bar.add_task(stage, total=total)
+            bar.update(rows[stage], completed=ended, total=total)
 
-        yield watch
+        try:
+            yield show
+        finally:
+            bar.update(waiting, visible=False)
+
+
+@contextmanager
+def _lines() -> Iterator[Show]:
+    """A line every `LINE_EVERY` seconds, of the stages that have got on since."""
+    stages: dict[str, str] = {}
+    told = time.monotonic()
+
+    def show(stage: str, ended: int, total: int) -> None:
+        nonlocal told
+        stages[stage] = f"{stage} {ended:,}/{total:,}"
+        if time.monotonic() - told >= LINE_EVERY:
+            say(", ".join(stages.values()), to=err)
+            stages.clear()
+            told = time.monotonic()
+
+    yield show

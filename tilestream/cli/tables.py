@@ -1,6 +1,7 @@
 """What the commands print: facts as tables for people, as plain values for machines."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import pandas as pd
@@ -155,17 +156,16 @@ def error_table(labels: pd.DataFrame) -> Table:
     return table
 
 
-def report_table(report: dict[str, Any]) -> Table:
-    """The headline of a report, and its worst places."""
-    table = Table(title=str(report["title"]), title_justify="left", box=SIMPLE)
-    table.add_column("fact")
-    table.add_column("value", justify="right")
-    for name, value in report["headline"].items():
-        if isinstance(value, int | float):
-            table.add_row(name, f"{value:.4g}" if isinstance(value, float) else f"{value:,}")
+def report_table(report: dict[str, Any], figures: Sequence[tuple[str, str]]) -> Table:
+    """The headline of a report, figure and meaning, and its worst places."""
+    table = Table(title=str(report["title"]), title_justify="left", box=SIMPLE, show_header=False)
+    table.add_column(justify="right", no_wrap=True)
+    table.add_column()
+    for figure, meaning in figures:
+        table.add_row(*(" ".join(text.split()) for text in (figure, meaning)))  # plain spaces
     for worst in report["worst"][:3]:
-        where = f"worst: {worst['route_id']} at {worst['arc_length']:.0f} m"
-        table.add_row(where, f"{worst['estimate']:.3g} m")
+        where = f"on {worst['route_id']} at {worst['arc_length']:.0f} m, of the worst places"
+        table.add_row(f"{worst['estimate'] * 100:.1f} cm", where)
     return table
 
 

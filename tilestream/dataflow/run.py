@@ -430,7 +430,7 @@ def dask_client(
                 host,
                 risk if tls is None else "watch the run, though only certificates let them act",
             )
-        logger.info("starting %d workers", count)
+        logger.info("starting %d workers; the first time, they compile kernels for a minute", count)
         with (
             distributed.LocalCluster(
                 n_workers=count,

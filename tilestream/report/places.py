@@ -34,11 +34,10 @@ MOST_ROUTES = 40
 """Routes that the page lists, the worst by their 95 % quantile; `report.json` has all."""
 
 
-def headline(content: Mapping[str, Any]) -> str:
-    """The figures that a map team asks for first."""
+def cards(content: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The figures that a map team asks for first, and what each of them is."""
     head, limit = content["headline"], length(content["threshold"], 0)
-    over = f"{percent(head['over_share'])} over {limit}"
-    cards = [
+    return [
         (road(head["length"]), f"of road, {count(head['places'])} sample points"),
         (length(head["median"]), "median estimated error"),
         (length(head["p95"]), "95 % of the places are estimated below this"),
@@ -51,8 +50,15 @@ def headline(content: Mapping[str, Any]) -> str:
         (count(head["labelled"]), "measured errors to train on and to judge by"),
         (count(head["missing"]), f"places without an estimate ({percent(head['missing_share'])})"),
     ]
+
+
+def headline(content: Mapping[str, Any]) -> str:
+    """The section that begins the page."""
+    head, limit = content["headline"], length(content["threshold"], 0)
+    over = f"{percent(head['over_share'])} over {limit}"
     body = '<div class="cards">' + "".join(
-        f'<div class="card"><b>{figure}</b><span>{what}</span></div>' for figure, what in cards
+        f'<div class="card"><b>{figure}</b><span>{what}</span></div>'
+        for figure, what in cards(content)
     )
     body += "</div>" + _missing(head) + _routes(content, limit)
     if not head["estimated"]:
