@@ -4,10 +4,15 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
+import yaml
 from scenes import PLACES
+from streets import job, write_drive
+from streets import street as street_of
 
 from tilestream.cli import run
+from tilestream.cli.app import COMMANDS, command_of
 from tilestream.formats.las import write_las
 from tilestream.formats.pcd import write_pcd
 
@@ -57,6 +62,48 @@ def test_the_drive_block_runs(
             arguments += ["--spacing", "12"]
         assert run(arguments) == 0
     assert "mean_m" in capsys.readouterr().out
+
+
+def test_the_city_block_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_pcd(tmp_path / "map_canyon.pcd", street_of("canyon", 1, 0.3))
+    few: dict[str, object] = {"spacing": 12.0, "observe": {"starts": 16}}
+    routes = [str(write_drive(tmp_path / "canyon.mcap", "canyon"))]
+    physics = {"drives": [], "routes": routes, "model": {"recipe": "physics"}}
+    own = job(tmp_path, tmp_path / "my-city", **few, **physics).model_dump(mode="json")
+    template, *others = block("tilestream template").strip().splitlines()
+    assert template == "tilestream template > my-city.yaml"
+    assert run(["template"]) == 0
+    told = yaml.safe_load(capsys.readouterr().out)
+    assert told.keys() <= own.keys()
+    Path("my-city.yaml").write_text(yaml.safe_dump(told | own))
+    for line in others:
+        program, *arguments = line.split("#")[0].split()
+        assert program == "tilestream"
+        if arguments[0] == "run":
+            arguments += ["--workers", "1"]
+        assert run(arguments) == int("--fail-over" in arguments and over(0.25))
+    assert (tmp_path / "my-city" / "report" / "index.html").is_file()
+
+
+def over(limit: float) -> bool:
+    return bool(pd.read_csv("my-city/report/places.csv")["estimate"].max() > limit)
+
+
+def test_no_block_is_left_out() -> None:
+    ran = {"import tilestream as ts", "--blind-rear", "tilestream template"}
+    setups = {"tilestream demo", "pytest"}
+    for _, text in BLOCKS:
+        assert sum(part in text for part in ran | setups) == 1
+
+
+def test_every_option_in_the_text_is_one_of_a_command() -> None:
+    text = re.sub(r"```.*?```", "", README, flags=re.DOTALL)
+    named = set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", text))
+    options = {option for name in COMMANDS for p in command_of(name).params for option in p.opts}
+    assert {"--scheduler", "--host", "--tls-ca", "--tls-cert", "--tls-key"} <= named <= options
 
 
 def test_both_commands_are_one_line_each_and_ci_runs_the_second() -> None:

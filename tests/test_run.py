@@ -2,6 +2,7 @@
 
 import itertools
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -9,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import dask
@@ -21,7 +23,7 @@ from hypothesis import strategies as st
 from naps import Nap
 
 from tilestream.dataflow.plan import Plan
-from tilestream.dataflow.run import dask_client, execute, report_kept
+from tilestream.dataflow.run import _Workers, dask_client, execute, report_kept
 from tilestream.dataflow.tasks import Outcome, perform
 from tilestream.errors import PlanError, TaskError, TilestreamError, UsageError
 from tilestream.tiling import TileKey
@@ -246,6 +248,39 @@ def test_another_address_than_loopback_is_warned_of(caplog: pytest.LogCaptureFix
     assert "whoever reaches them can run code here" in caplog.text
 
 
+def test_a_worker_that_is_busy_is_waited_for_and_that_is_said(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level("INFO", "tilestream")
+
+    class Client:
+        status = "running"
+        scheduler = SimpleNamespace(address="tcp://10.0.0.1:8786")
+        asked = 0
+
+        def run(self, *_: object, **__: object) -> dict[str, list[str]]:
+            self.asked += 1
+            if self.asked <= 2:
+                raise TimeoutError
+            return {"tcp://10.0.0.2:1234": []}
+
+    client = Client()
+    _Workers(client, patience=60.0).wait_for_orphans()
+    assert client.asked == 3
+    assert caplog.text.count("busy and does not answer yet") == 1
+    with pytest.raises(TaskError, match="has not answered for 0 s"):
+        _Workers(Client(), patience=0.0).wait_for_orphans()
+
+
+def test_workers_of_our_own_live_through_an_interrupt() -> None:
+    with dask_client(None, 2, 10**9) as client:
+        assert client is not None
+        before = set(client.run(os.getpid).values())
+        for worker in before:
+            os.kill(worker, signal.SIGINT)
+        assert set(client.run(os.getpid).values()) == before
+
+
 @pytest.mark.slow
 def test_workers_print_nothing(tmp_path: Path) -> None:
     script = tmp_path / "quiet.py"
@@ -356,6 +391,27 @@ def test_nobody_answers() -> None:
         dask_client("tcp://127.0.0.1:9", None, 1),
     ):
         pass
+
+
+def test_a_client_that_failed_is_closed_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else it closes itself when it is collected, which may be inside of Dask's own lock."""
+    made: list[distributed.Client] = []
+    start = distributed.Client.start
+
+    def noted(client: distributed.Client, **how: Any) -> None:
+        made.append(client)
+        start(client, **how)
+
+    monkeypatch.setattr(distributed.Client, "start", noted)
+    with (
+        dask.config.set({"distributed.comm.timeouts.connect": "200ms"}),
+        pytest.raises(TaskError, match="no Dask scheduler answers"),
+        dask_client("tcp://127.0.0.1:1", None, 1),
+    ):
+        pass
+    (client,) = made
+    assert client.status == "closed"
+    assert not client._loop_runner.is_started()
 
 
 def test_an_address_that_is_none() -> None:

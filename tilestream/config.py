@@ -1,12 +1,16 @@
 """Settings: frozen pydantic models; a unit and a meaning per field; unknown keys refused."""
 
 import difflib
+import re
 from collections.abc import Iterator
 from typing import Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from tilestream.errors import UsageError
+
+NESTED = re.compile(r" \w+Settings: ")
+"""How settings inside others begin what is wrong with them: the key above says which they are."""
 
 
 class Settings(BaseModel):
@@ -36,7 +40,8 @@ def _readable(error: ValidationError, known: list[str]) -> Iterator[str]:
             hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
             yield f"{key} is no setting: {hint}"
         elif problem["type"] == "value_error":
-            yield f"{key} {problem['msg'].removeprefix('Value error, ')}".strip()
+            said = problem["msg"].removeprefix("Value error, ")
+            yield NESTED.sub(": ", f"{key} {said}").strip()
         else:
             yield f"{key} is {problem['input']!r}: {problem['msg']}"
 

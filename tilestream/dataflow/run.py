@@ -3,6 +3,7 @@
 import logging
 import os
 import queue
+import signal
 import time
 import uuid
 from collections import Counter, deque
@@ -334,14 +335,19 @@ class _Workers:
         Raises:
             TaskError: the scheduler is lost, or a worker has not answered for the patience.
         """
-        said = False
+        said = told = False
+        asked = time.monotonic()
         while True:
             self.require_scheduler()
+            within = min(RESULT_WITHIN, self._patience)
             try:
-                found = self._client.run(
-                    _orphans, on_error="ignore", callback_timeout=self._patience
-                )
+                found = self._client.run(_orphans, on_error="ignore", callback_timeout=within)
             except TimeoutError:
+                if time.monotonic() - asked < self._patience:
+                    if not said:
+                        logger.info("waiting for a worker that is busy and does not answer yet")
+                        said = True
+                    continue
                 raise TaskError(
                     f"a worker of the scheduler at {self._address} has not answered for "
                     f"{self._patience:.0f} s: restart it, then run the same command again"
@@ -351,9 +357,10 @@ class _Workers:
             left = sorted(key for keys in found.values() for key in keys)
             if not left:
                 return
-            if not said:
+            if not told:
                 logger.info("waiting for %s of an earlier run to end", ", ".join(left))
-                said = True
+                told = True
+            asked = time.monotonic()
             time.sleep(0.2)
 
     def _lost(self) -> TaskError:
@@ -389,6 +396,17 @@ class TlsFiles:
         named = {f"tls_{role}_cert": self.cert for role in roles}
         named |= {f"tls_{role}_key": self.key for role in roles}
         return distributed.Security(tls_ca_file=self.ca, require_encryption=True, **named)
+
+
+class _DeafToInterrupts(distributed.WorkerPlugin):
+    """Lets a worker of our own live through Ctrl-C, which a terminal sends to all its processes.
+
+    The command ends, and takes its workers along; without them it would wait for others.
+    """
+
+    def setup(self, worker: Any) -> None:  # noqa: ARG002 - Dask's signature
+        """In a worker's main thread, also of one that was restarted."""
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 @contextmanager
@@ -445,17 +463,35 @@ def dask_client(
             ) as cluster,
             distributed.Client(cluster) as client,
         ):
+            client.register_plugin(_DeafToInterrupts())
             logger.debug("%d workers of %s each", count, megabytes(2 * memory))
             yield client
     else:
         yield None
 
 
+class _Client(distributed.Client):
+    """A client that is closed at once where it cannot connect.
+
+    Left to the garbage collector it would close itself at any moment, even while its own thread
+    holds the lock of Dask's event loops, and would wait for that lock for ever.
+    """
+
+    def start(self, **kwargs: Any) -> None:
+        """Connect, as the constructor of Dask's client asks for."""
+        try:
+            super().start(**kwargs)  # type: ignore[no-untyped-call]
+        except BaseException:
+            self.close()  # type: ignore[no-untyped-call]
+            self._loop_runner.stop()  # which is left running where Dask closed the client itself
+            raise
+
+
 @contextmanager
 def _connected(scheduler: str, security: Any | None) -> Iterator[Any]:
     """A client of a scheduler that runs elsewhere."""
     try:
-        client = distributed.Client(scheduler, security=security)
+        client = _Client(scheduler, security=security)  # type: ignore[no-untyped-call]
     except (OSError, TimeoutError, CommClosedError) as error:
         raise TaskError(f"no Dask scheduler answers at {scheduler}: {error}") from error
     except (ValueError, TypeError, RuntimeError) as error:  # of an address without its

@@ -233,7 +233,8 @@ def read_settings(path: str | os.PathLike[str], changes: Sequence[str] = ()) -> 
     try:
         return RunSettings(**values)
     except (UsageError, ValidationError, TypeError) as error:
-        raise UsageError(f"{place}: {error}") from None
+        told = str(error).removeprefix(f"{RunSettings.__name__}: ")
+        raise UsageError(f"{place}: {told}") from None
 
 
 def _apply(values: dict[str, object], change: str) -> None:
