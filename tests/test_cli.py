@@ -183,6 +183,18 @@ def test_a_traceback_only_with_debug(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert plain.err in debug.stderr
 
 
+def test_an_interrupt_is_told_in_one_line(
+    pcd: Path, monkeypatch: pytest.MonkeyPatch, capsys: Told
+) -> None:
+    def interrupted(_: str) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("tilestream.cli.maps.describe", interrupted)
+    assert run(["info", str(pcd)]) == 130
+    told = capsys.readouterr().err.strip()
+    assert told == "stopped; the same command continues where it was"
+
+
 def test_amounts_of_memory() -> None:
     assert parse_bytes("512MB") == 512_000_000
     assert parse_bytes(" 1.5 gb ") == 1_500_000_000

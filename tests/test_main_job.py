@@ -418,6 +418,13 @@ def test_the_template_is_a_job_and_explains_every_setting(
     assert explained == settings
 
 
+def test_a_run_directory_that_is_a_file_is_named(inputs: Path, tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("mine")
+    for out in (tmp_path / "taken", tmp_path / "taken" / "run"):
+        with pytest.raises(UsageError, match=f"{out} is a file, or below one"):
+            ts.run(job(inputs, out))
+
+
 def test_a_log_that_is_not_there_is_named(inputs: Path, tmp_path: Path) -> None:
     drives = [{"log": str(tmp_path / "nowhere.mcap")}]
     with pytest.raises(SourceNotFoundError, match=r"nowhere\.mcap"):

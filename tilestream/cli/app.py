@@ -1,7 +1,7 @@
 """The command line: its commands, and the only place that exits.
 
 Exit codes: 0 all good; 1 some sources, tiles or scans failed and are listed, the rest is done;
-2 usage, or a job that does not fit its memory or disk.
+2 usage, or a job that does not fit its memory or disk; 130 Ctrl-C.
 """
 
 import logging
@@ -23,6 +23,8 @@ from tilestream.errors import (
 )
 from tilestream.version import VERSION
 
+INTERRUPTED = 130
+"""Exit code of a command that was stopped with Ctrl-C."""
 MARKUP: Any = "markdown"  # the other mode takes [m] for a style
 COMMANDS = {
     "ingest": ("maps", "Make a tile store from point clouds, map directories and logs of drives."),
@@ -118,6 +120,8 @@ def run(arguments: list[str]) -> int:
     try:
         app(args=[a for a in arguments if a != "--debug"], prog_name="tilestream")
     except SystemExit as end:
+        if end.code == INTERRUPTED:
+            say("stopped; the same command continues where it was", to=err)
         return int(end.code or 0)
     except (UsageError, SourceNotFoundError, StoreNotFoundError, PlanError) as error:
         return _report(error, debug, 2)

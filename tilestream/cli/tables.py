@@ -196,7 +196,15 @@ def comparison_table(content: dict[str, Any]) -> Table:
     over = f"over {content['threshold']:g} m"
     table = Table(title="comparison", title_justify="left", box=SIMPLE)
     table.add_column("choice", no_wrap=True)
-    for column in ("median [m]", "95 % [m]", "max [m]", over, "p_fail", "lost", "map [MB]"):
+    for column in (
+        "median [m]",
+        "95 % [m]",
+        "max [m]",
+        over,
+        "starts that fail",
+        "no estimate",
+        "map [MB]",
+    ):
         table.add_column(column, justify="right")
     for choice in content["choices"]:
         figures = (choice[name] for name in ("median", "p95", "max", "over_share", "p_fail"))

@@ -42,7 +42,7 @@ from tilestream.dataflow.plan import Plan, Task
 from tilestream.dataflow.run import Watch, execute, report_kept
 from tilestream.dataflow.run_settings import RunSettings, read_settings
 from tilestream.dataflow.tasks import Outcome
-from tilestream.errors import PartialError
+from tilestream.errors import PartialError, UsageError
 from tilestream.forest.dataset import Dataset
 from tilestream.report import write_report
 from tilestream.tables import remove_others
@@ -170,7 +170,12 @@ def dataset(run_dir: str | os.PathLike[str]) -> Dataset:
 
 def _begin(settings: RunSettings) -> _Book:
     """The run directory with the effective settings."""
-    settings.folder.mkdir(parents=True, exist_ok=True)
+    try:
+        settings.folder.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise UsageError(
+            f"{settings.out} is a file, or below one: name another run directory"
+        ) from None
     text = yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
     _write_text(settings.folder / "config.yaml", text)
     book = _Book(settings.folder)
