@@ -202,7 +202,7 @@ def comparison_table(content: dict[str, Any]) -> Table:
         "max [m]",
         over,
         "starts that fail",
-        "no estimate",
+        "lost",
         "map [MB]",
     ):
         table.add_column(column, justify="right")
