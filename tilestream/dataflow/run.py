@@ -335,33 +335,34 @@ class _Workers:
         Raises:
             TaskError: the scheduler is lost, or a worker has not answered for the patience.
         """
-        said = told = False
-        asked = time.monotonic()
-        while True:
-            self.require_scheduler()
-            within = min(RESULT_WITHIN, self._patience)
-            try:
-                found = self._client.run(_orphans, on_error="ignore", callback_timeout=within)
-            except TimeoutError:
-                if time.monotonic() - asked < self._patience:
-                    if not said:
-                        logger.info("waiting for a worker that is busy and does not answer yet")
-                        said = True
-                    continue
+        answered, told = time.monotonic(), ""
+        while (busy := self._orphans()) != []:
+            if busy is not None:
+                answered = time.monotonic()
+                awaited = f"{', '.join(busy)} of an earlier run to end"
+            elif time.monotonic() - answered < self._patience:
+                awaited = "a worker that is busy and does not answer yet"
+            else:
                 raise TaskError(
                     f"a worker of the scheduler at {self._address} has not answered for "
                     f"{self._patience:.0f} s: restart it, then run the same command again"
-                ) from None
-            except (OSError, CommClosedError):
-                raise self._lost() from None
-            left = sorted(key for keys in found.values() for key in keys)
-            if not left:
-                return
-            if not told:
-                logger.info("waiting for %s of an earlier run to end", ", ".join(left))
-                told = True
-            asked = time.monotonic()
+                )
+            if awaited != told:
+                logger.info("waiting for %s", awaited)
+                told = awaited
             time.sleep(0.2)
+
+    def _orphans(self) -> list[str] | None:
+        """Keys of tasks of ours that nobody wants any more; None: a worker does not answer."""
+        self.require_scheduler()
+        within = min(RESULT_WITHIN, self._patience)
+        try:
+            found = self._client.run(_orphans, on_error="ignore", callback_timeout=within)
+        except TimeoutError:
+            return None
+        except (OSError, CommClosedError):
+            raise self._lost() from None
+        return sorted(key for keys in found.values() for key in keys)
 
     def _lost(self) -> TaskError:
         return TaskError(
