@@ -48,6 +48,8 @@ def _nap(task: Nap) -> str:
 def fail(how: str) -> None:
     if how == "disk":
         raise OSError(28, "No space left on device")
+    if how == "path":
+        raise NotADirectoryError(20, "Not a directory")
     if how == "memory":
         raise MemoryError
     if how == "killed":

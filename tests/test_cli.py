@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -506,8 +507,10 @@ def test_localize_prints_the_errors(log: Path, store: str, tmp_path: Path, capsy
     few = ["--radius", "0.4", "--out", str(tmp_path)]
     assert run(["localize", store, str(log), *few, "--until-s", "5"]) == 0
     shown = capsys.readouterr().out
-    assert "mean_m" in shown
-    assert "worst: scan" in shown
+    assert re.search(r" 5 +sample points", shown)
+    assert re.search(r" \d+\.\d cm +mean error", shown)
+    assert shown.count("of the worst places") == 3
+    assert "mean_m" not in shown
     assert f"{tmp_path}/errors" in shown.replace("\n", "")
     assert run(["localize", store, str(log), *few, "--json"]) == 1
     told = capsys.readouterr()
@@ -537,6 +540,24 @@ def test_the_json_of_a_drive_where_all_failed_is_json(
     assert facts["mean_m"] is None
     assert run(["localize", store, str(log), *sparse[:-1]]) == 1
     assert "6 of 6 scans failed" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("place", ["taken", "taken/below"])
+def test_a_folder_that_is_a_file_is_refused_at_once(
+    place: str, log: Path, pcd: Path, store: str, tmp_path: Path, capsys: Told
+) -> None:
+    (tmp_path / "taken").write_text("mine")
+    out = str(tmp_path / place)
+    for arguments in (
+        ["ingest", str(pcd), "--store", out],
+        ["localize", store, str(log), "--out", out],
+        ["factors", store, "--route", str(log), "--out", out],
+        ["compare", store, "--route", str(log), "--out", out],
+    ):
+        line = fails(arguments, 2, capsys)
+        assert out in line
+        assert "is a file, or below one" in line
+    assert (tmp_path / "taken").read_text() == "mine"
 
 
 @pytest.mark.parametrize(

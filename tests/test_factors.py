@@ -1,5 +1,6 @@
 """The table of factors: what it answers where there is little to see, and how it says so."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from tilestream.factors import table as table_module
 from tilestream.factors.catalogue import COLUMNS, COUNTS, columns_of, markdown
 from tilestream.factors.feature_sufficiency import dimensions, shape_shares
 from tilestream.factors.table import TermsCache, factors
-from tilestream.factors.terms import reach_mm, terms_inputs, terms_table, tile_terms
+from tilestream.factors.terms import reach_mm, terms_mark, terms_table, tile_terms
 from tilestream.formats.pcd import write_pcd
 from tilestream.store import POINTS, Mark, Tile, TileStore
 
@@ -189,15 +190,16 @@ def test_terms_from_the_store_are_those_made_now(canyon: TileStore, tmp_path: Pa
     store = store_of(tmp_path, scene("canyon", 31))
     fresh = factors(store, ROUTE, which="all")
     for key in store.keys():
-        inputs = terms_inputs(store, key, 2000)
         arrays = tile_terms(store, key).arrays()
-        store.tile(key).write_table(terms_table(2000), arrays, Mark("done", inputs=inputs))
+        now = terms_mark(store, key, 2000)
+        store.tile(key).write_table(terms_table(2000), arrays, now)
     assert factors(store, ROUTE, which="all").equals(fresh)
-    key = store.keys()[0]
-    empty = {name: array[:0] for name, array in arrays.items() if name not in ("names", "whole")}
-    table = {**empty, "names": arrays["names"], "whole": arrays["whole"]}
-    store.tile(key).write_table(terms_table(2000), table, Mark("done", inputs="of another map"))
-    assert factors(store, ROUTE, which="all").equals(fresh)  # out of date: made anew
+    odd = {**arrays, "mean": arrays["mean"] + 1.0}
+    store.tile(key).write_table(terms_table(2000), odd, now)
+    assert not factors(store, ROUTE, which="all").equals(fresh)
+    for other in ({"inputs": "another map"}, {"settings": "others"}, {"code": "0.0.1"}):
+        store.tile(key).write_table(terms_table(2000), odd, replace(now, **other))
+        assert factors(store, ROUTE, which="all").equals(fresh), "out of date: made anew"
 
 
 def test_a_small_cache_forgets_and_answers_the_same(canyon: TileStore) -> None:

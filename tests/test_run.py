@@ -136,6 +136,7 @@ def test_a_plan_names_the_task_that_does_not_fit() -> None:
         ("disk", 2, 3, ""),
         ("disk", 9, 3, "[Errno 28] No space left on device (OSError) (tried 3 times)"),
         ("memory", 1, 2, ""),
+        ("path", 1, 1, "[Errno 20] Not a directory (NotADirectoryError)"),
         ("no such tile", 1, 1, "no such tile"),
         ("bug", 1, 1, "ZeroDivisionError: bug"),
     ],

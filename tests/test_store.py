@@ -3,6 +3,7 @@
 import json
 import pickle
 import uuid
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from tilestream.errors import (
     UsageError,
 )
 from tilestream.formats.pcd import write_pcd
-from tilestream.store import POINTS, Mark, Tile, hash_of
+from tilestream.store import POINTS, Mark, Tile, cells_mark, cells_table, hash_of
 from tilestream.tiling import TileKey
 
 
@@ -150,6 +151,21 @@ def test_the_same_work_is_known_by_inputs_settings_and_code() -> None:
     ):
         assert not mark.same_work(other)
     assert hash_of("a", 1.5, [2]) == hash_of("a", 1.5, (2,)) != hash_of("a", 1.5, [3])
+
+
+def test_cells_are_read_from_their_table_while_it_is_up_to_date(
+    tmp_path: Path, cloud: np.ndarray
+) -> None:
+    tile = make_store(tmp_path, cloud, tile_size=100.0, map_leaf=0.0).tile_at(1.0, 1.0)
+    made = tile.cells(2.0)
+    now, name = cells_mark(tile.mark(POINTS), 2000), cells_table(2000)
+    columns = {"index": made.index, "count": made.count + 1, "mean": made.mean}
+    columns |= {"covariance": made.covariance}
+    tile.write_table(name, columns, now)
+    np.testing.assert_array_equal(tile.cells(2.0).count, made.count + 1)
+    for out_of_date in ({"inputs": "other points"}, {"settings": "others"}, {"code": "0.0.1"}):
+        tile.write_table(name, columns, replace(now, **out_of_date))
+        np.testing.assert_array_equal(tile.cells(2.0).count, made.count)
 
 
 def test_what_is_no_store_is_refused_by_name(tmp_path: Path) -> None:

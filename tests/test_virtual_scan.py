@@ -1,5 +1,6 @@
 """The virtual scan: closed forms, a literal reference, invariances, any tiling, no leaks."""
 
+from dataclasses import replace
 from itertools import pairwise, product
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from tilestream.factors.surfels import (
     surfel_mm,
     surfels_in,
     surfels_inputs,
+    surfels_mark,
     surfels_table,
     tile_surfels,
 )
@@ -37,7 +39,6 @@ from tilestream.kernels.cells import cell_sums
 from tilestream.kernels.depth_image import thin
 from tilestream.kernels.surfels import NORMAL_ONE, surfels_of
 from tilestream.kernels.virtual_scan import cast
-from tilestream.store import Mark
 from tilestream.tiling import Box
 
 Floats = np.ndarray
@@ -296,9 +297,12 @@ def test_a_table_of_surfels_is_used_while_it_is_up_to_date(cloud: Path, tmp_path
     made = tile_surfels(store, key)
     other = made.where(np.arange(len(made)) < 5)
     name, columns = surfels_table(surfel_mm(store)), surfel_columns(store, key, other)
-    store.tile(key).write_table(name, columns, Mark("done", inputs="of another map"))
-    assert len(read_surfels(store, key)) == len(made)
-    now = Mark("done", inputs=surfels_inputs(store, key))
+    now = surfels_mark(store, key)
+    store.tile(key).write_table(name, columns, now)
+    assert len(read_surfels(store, key)) == 5
+    for out_of_date in ({"inputs": "another map"}, {"settings": "others"}, {"code": "0.0.1"}):
+        store.tile(key).write_table(name, columns, replace(now, **out_of_date))
+        assert len(read_surfels(store, key)) == len(made)
     store.tile(key).write_table(name, surfel_columns(store, key, made), now)
     kept = read_surfels(store, key)
     np.testing.assert_array_equal(kept.centre_mm, made.centre_mm)

@@ -41,6 +41,8 @@ SCHEMA = 1
 """Version of the store's layout; a store with a larger one is refused."""
 POINTS = "points"
 """Name of the table that ingest writes: the column `xyz`."""
+CELLS_VERSION = 1
+"""Raise it when the cells that are made from the same points change."""
 _CODEC = BloscCodec(cname="zstd", clevel=3, shuffle="bitshuffle")
 _OURS = "tilestream"
 
@@ -155,10 +157,7 @@ class Tile:
         cell_mm = whole_mm(cell_size, "cell_size")
         self.store.grid.require_cell_size(cell_mm)
         name = cells_table(cell_mm)
-        if (
-            self.mark(name).status == "done"
-            and self.mark(name).inputs == self.mark(POINTS).identity
-        ):
+        if self.mark(name).same_work(cells_mark(self.mark(POINTS), cell_mm)):
             return Cells(**self.read_table(name), cell_size=cell_size)
         return cells_of_mm(self.points_mm(), cell_mm)
 
@@ -419,6 +418,11 @@ def cells_table(cell_mm: int) -> str:
     return f"cells_{cell_mm}"
 
 
+def cells_mark(points: Mark, cell_mm: int) -> Mark:
+    """The mark of the cells of one size, made from a tile's points by this code."""
+    return Mark("done", inputs=points.identity, settings=hash_of(cell_mm, CELLS_VERSION))
+
+
 def open_store(url: str) -> TileStore:
     """Open a tile store that `ingest` made.
 
@@ -429,6 +433,7 @@ def open_store(url: str) -> TileStore:
         StoreNotFoundError: nothing there.
         StoreVersionError: written by a newer version of tilestream.
         StoreError: something else lies there.
+        UsageError: a file lies there, or where a folder above it would be.
     """
     fs, root = fsspec.core.url_to_fs(str(url))
     attributes = _root_attributes(fs, str(root).rstrip("/"), str(url))
@@ -441,6 +446,10 @@ def _root_attributes(fs: Any, root: str, url: str) -> dict[str, Any]:
     except FileNotFoundError:
         raise StoreNotFoundError(
             f"no tile store at {url}: make one with `tilestream ingest SOURCES --store {url}`"
+        ) from None
+    except NotADirectoryError:
+        raise UsageError(
+            f"{url} is a file, or below one, and a tile store is a folder: name another path"
         ) from None
     try:
         attributes: dict[str, Any] = json.loads(text)["attributes"][_OURS]

@@ -11,7 +11,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from tilestream.errors import CorruptSourceError, SourceNotFoundError
+from tilestream.errors import CorruptSourceError, SourceNotFoundError, UsageError
 from tilestream.records import Column
 
 _MARK = b"tilestream"
@@ -73,9 +73,19 @@ def is_done(path: str, identity: str) -> bool:
 
 
 def remove_others(keep: Sequence[str]) -> None:
-    """Remove what lies beside these tables in their folder: of other settings, or half-written."""
+    """Make the folder of these tables hold no others: of other settings, or half-written.
+
+    It is made where it is missing, so that one that cannot be is told before any work.
+
+    Raises:
+        UsageError: the folder is a file, or below one.
+    """
     fs, place = fsspec.core.url_to_fs(keep[0])
     folder = place.rsplit("/", 1)[0]
+    try:
+        fs.makedirs(folder, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise UsageError(f"{folder} is a file, or below one: name another folder") from None
     names = {path.rsplit("/", 1)[-1] for path in keep}
     for path in [*fs.glob(f"{folder}/*.parquet"), *fs.glob(f"{folder}/*.part")]:
         if str(path).rsplit("/", 1)[-1] not in names:

@@ -143,16 +143,38 @@ def error_facts(labels: pd.DataFrame) -> dict[str, float | None]:
     return {name: None if math.isnan(value) else value for name, value in facts.items()}
 
 
+CM, PERCENT = (100.0, " cm"), (100.0, " %")
+READ_AS = {
+    "mean_m": (*CM, "mean error"),
+    "median_m": (*CM, "median error"),
+    "p95_m": (*CM, "95 % of the places have less"),
+    "max_m": (*CM, "the largest"),
+    **{
+        f"share_over_{t:.2f}_m": (*PERCENT, f"of the places over {t * 100:g} cm")
+        for t in THRESHOLDS
+    },
+    "p_fail": (*PERCENT, "of the starts fail: they end over 50 cm away"),
+    "floor_m": (*CM, "of the mean is floor: what starts within 1 m end with"),
+    "tail_m": (*CM, "of the mean is tail: what farther starts add"),
+}
+"""Scale, unit and meaning of the facts of a drive, for people."""
+
+
 def error_table(labels: pd.DataFrame) -> Table:
-    """The errors of a drive, and its worst places."""
-    table = Table(title="localization error", title_justify="left", box=SIMPLE)
-    table.add_column("fact")
-    table.add_column("value", justify="right")
-    for name, value in error_facts(labels).items():
-        table.add_row(name, f"{value:.4g}" if isinstance(value, float) else str(value))
-    for row in labels.nlargest(3, "error_mean").itertuples():
-        place = f"worst: scan {row.scan} at {row.arc_length:.0f} m, ({row.x:.1f}, {row.y:.1f})"
-        table.add_row(place, f"{row.error_mean:.4g} m")
+    """The errors of a drive, figure and meaning, and its worst places."""
+    table = Table(title="localization error", title_justify="left", box=SIMPLE, show_header=False)
+    table.add_column(justify="right", no_wrap=True)
+    table.add_column()
+    facts = error_facts(labels)
+    table.add_row(f"{facts['sample_points']:,}", "sample points")
+    table.add_row(f"{facts['failed']:,}", "of them without a measurement")
+    for name, (scale, unit, meaning) in READ_AS.items():
+        value = facts[name]
+        table.add_row("none" if value is None else f"{value * scale:.1f}{unit}", meaning)
+    worst = labels.nlargest(3, "error_mean")
+    for row, error in zip(worst.itertuples(), worst["error_mean"] * 100.0, strict=True):
+        place = f"scan {row.scan} at {row.arc_length:.0f} m, ({row.x:.1f}, {row.y:.1f})"
+        table.add_row(f"{error:.1f} cm", f"{place}, of the worst places")
     return table
 
 

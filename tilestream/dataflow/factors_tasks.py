@@ -1,6 +1,6 @@
 """The stages that look at the map: terms (of a tile's cells), factors (of its sample points)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import pandas as pd
@@ -12,15 +12,13 @@ from tilestream.factors.catalogue import COLUMNS, Which
 from tilestream.factors.rows import PLACE_COLUMNS as PLACE_COLUMNS  # noqa: PLC0414 - for others
 from tilestream.factors.rows import STATUS_COLUMNS, Samples, sample_rows
 from tilestream.factors.table import TermsCache, factors
-from tilestream.factors.terms import terms_inputs, terms_table, tile_terms
+from tilestream.factors.terms import TERMS_VERSION, terms_mark, terms_table, tile_terms
 from tilestream.sensors import Sensor
-from tilestream.store import Mark, hash_of, open_store
+from tilestream.store import Mark, open_store
 from tilestream.tables import is_done, write_table
 from tilestream.tiling import MM_PER_M, TileKey
 from tilestream.version import VERSION
 
-TERMS_VERSION = 1
-"""Raise it when the terms that are made from the same points change."""
 FACTORS_VERSION = 1
 """Raise it when the factors that are made from the same terms change."""
 TERMS_BYTES = 600_000_000
@@ -96,18 +94,17 @@ class FactorsTask:
 def _terms(task: TermsTask) -> Mark:
     store = open_store(task.store_url)
     tile, name = store.tile(task.tile), terms_table(task.cell_mm)
-    inputs = terms_inputs(store, task.tile, task.cell_mm)
-    wanted = Mark("done", inputs=inputs, settings=hash_of(task.cell_mm, TERMS_VERSION))
+    wanted = terms_mark(store, task.tile, task.cell_mm)
     known = tile.mark(name)
     if known.same_work(wanted):
         return known
     try:
         terms = tile_terms(store, task.tile, task.cell_mm / MM_PER_M)
     except TileNotReadyError as error:
-        failed = Mark("failed", str(error), inputs, wanted.settings)
+        failed = replace(wanted, status="failed", reason=str(error))
         tile.write_reason(name, failed)  # the sample points that see it say so in their rows
         return failed
-    made = Mark("done", "", inputs, wanted.settings, VERSION, {"cells": len(terms.mean)})
+    made = replace(wanted, facts={"cells": len(terms.mean)})
     tile.write_table(name, terms.arrays(), made)
     return made
 

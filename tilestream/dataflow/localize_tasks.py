@@ -1,7 +1,7 @@
 """The three stages that measure errors: cells (of a tile), register (a slice of scans), label."""
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -26,13 +26,11 @@ from tilestream.localization import (
 )
 from tilestream.ndt import cells_of_mm
 from tilestream.records import Cells, Column, Float64, Scan, TruePose
-from tilestream.store import POINTS, Mark, TileStore, cells_table, hash_of, open_store
+from tilestream.store import POINTS, Mark, TileStore, cells_mark, cells_table, hash_of, open_store
 from tilestream.tables import is_done, read_mark, read_tables, write_table
 from tilestream.tiling import MM_PER_M, Box, TileKey
 from tilestream.version import VERSION
 
-CELLS_VERSION = 1
-"""Raise it when the cells that are made from the same points change."""
 LABEL_VERSION = 1
 """Raise it when the labels that are made from the same scans and cells change."""
 MARGIN = 10.0
@@ -294,9 +292,7 @@ def _named(*parts: object) -> list[str]:
 def _cells(task: CellsTask) -> Mark:
     store = open_store(task.store_url)
     tile, name = store.tile(task.tile), cells_table(task.cell_mm)
-    wanted = Mark(
-        "done", inputs=tile.require(POINTS).identity, settings=hash_of(task.cell_mm, CELLS_VERSION)
-    )
+    wanted = cells_mark(tile.require(POINTS), task.cell_mm)
     known = tile.mark(name)
     if known.same_work(wanted):
         return known
@@ -307,7 +303,7 @@ def _cells(task: CellsTask) -> Mark:
         "mean": cells.mean,
         "covariance": cells.covariance,
     }
-    made = Mark("done", "", wanted.inputs, wanted.settings, wanted.code, {"cells": len(cells)})
+    made = replace(wanted, facts={"cells": len(cells)})
     tile.write_table(name, columns, made)
     return made
 

@@ -1,6 +1,6 @@
 """The stages that look from the map itself: surfels (of a tile), observe (its sample points)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import pandas as pd
@@ -12,21 +12,20 @@ from tilestream.errors import TileNotReadyError
 from tilestream.factors.observability import COLUMNS, observability
 from tilestream.factors.rows import PLACE_COLUMNS, STATUS_COLUMNS, Samples, sample_rows
 from tilestream.factors.surfels import (
+    SURFELS_VERSION,
     surfel_columns,
     surfel_mm,
-    surfels_inputs,
+    surfels_mark,
     surfels_table,
     tile_surfels,
 )
 from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.sensors import Sensor
-from tilestream.store import Mark, hash_of, open_store
+from tilestream.store import Mark, open_store
 from tilestream.tables import is_done, write_table
 from tilestream.tiling import TileKey
 from tilestream.version import VERSION
 
-SURFELS_VERSION = 1
-"""Raise it when the surfels that are made from the same points change."""
 OBSERVE_VERSION = 2
 """Raise it when what is observed from the same surfels and cells changes."""
 SURFELS_BYTES = 400_000_000
@@ -119,19 +118,18 @@ class ObserveTask:
 @perform.register
 def _surfels(task: SurfelsTask) -> Mark:
     store = open_store(task.store_url)
-    tile, edge_mm = store.tile(task.tile), surfel_mm(store)
-    name, inputs = surfels_table(edge_mm), surfels_inputs(store, task.tile)
-    wanted = Mark("done", inputs=inputs, settings=hash_of(edge_mm, SURFELS_VERSION))
+    tile, name = store.tile(task.tile), surfels_table(surfel_mm(store))
+    wanted = surfels_mark(store, task.tile)
     known = tile.mark(name)
     if known.same_work(wanted):
         return known
     try:
         surfels = tile_surfels(store, task.tile)
     except TileNotReadyError as error:
-        failed = Mark("failed", str(error), inputs, wanted.settings)
+        failed = replace(wanted, status="failed", reason=str(error))
         tile.write_reason(name, failed)  # the sample points that see it say so in their rows
         return failed
-    made = Mark("done", "", inputs, wanted.settings, VERSION, {"surfels": len(surfels)})
+    made = replace(wanted, facts={"surfels": len(surfels)})
     tile.write_table(name, surfel_columns(store, task.tile, surfels), made)
     return made
 

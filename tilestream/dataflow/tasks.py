@@ -13,6 +13,8 @@ from tilestream.errors import TaskError, TilestreamError
 
 NOT_RUN = "not run, since "
 """How the reason of a task begins that was refused because of another one."""
+STANDING = (FileExistsError, IsADirectoryError, NotADirectoryError, PermissionError)
+"""What the disk refuses in the same way however often it is asked."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +56,8 @@ def perform(task: Task) -> object:
 def attempt(task: Task) -> Outcome:
     """Do the work of a task and say what became of it; never raises.
 
-    A verdict of our own on the data (`TilestreamError`) or a bug stands; where the disk, the
-    network or the memory failed, another try may succeed.
+    A verdict of our own on the data (`TilestreamError`), a path that cannot be used and a bug
+    stand; where the disk, the network or the memory failed, another try may succeed.
     """
     began, passing = time.perf_counter(), False
     try:
@@ -67,7 +69,7 @@ def attempt(task: Task) -> Outcome:
         passing = True
     except OSError as error:
         reason, details = f"{error} ({type(error).__name__})", traceback.format_exc()
-        passing = True
+        passing = not isinstance(error, STANDING)
     except Exception as error:  # noqa: BLE001 - whatever fails is listed, and the others go on
         reason, details = f"{type(error).__name__}: {error}", traceback.format_exc()
     else:

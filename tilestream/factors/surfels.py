@@ -15,9 +15,11 @@ from tilestream.kernels.cells import cell_sums
 from tilestream.kernels.depth_image import thin
 from tilestream.kernels.surfels import surfels_of
 from tilestream.records import Int64
-from tilestream.store import MISSING, POINTS, Tile, TileStore, hash_of
+from tilestream.store import MISSING, POINTS, Mark, Tile, TileStore, hash_of
 from tilestream.tiling import Box, TileKey, whole_mm
 
+SURFELS_VERSION = 1
+"""Raise it when the surfels that are made from the same points change."""
 FINEST_MM = 200
 """Smallest edge of the voxels of surfels [mm]."""
 REACH_EDGES = 4
@@ -74,6 +76,12 @@ def surfels_inputs(
     return hash_of([(str(near), Tile(store, near).mark(POINTS).identity) for near in keys])
 
 
+def surfels_mark(store: TileStore, key: TileKey) -> Mark:
+    """The mark of the surfels that are made from the store's points by this code."""
+    settings = hash_of(surfel_mm(store), SURFELS_VERSION)
+    return Mark("done", inputs=surfels_inputs(store, key), settings=settings)
+
+
 def tile_surfels(store: TileStore, key: TileKey) -> Surfels:
     """The surfels of the voxels whose lowest corners a tile owns: the same for any tiling.
 
@@ -104,8 +112,7 @@ def read_surfels(store: TileStore, key: TileKey) -> Surfels:
         TileNotReadyError: as `tile_surfels`.
     """
     tile, name = Tile(store, key), surfels_table(surfel_mm(store))
-    mark = tile.mark(name)
-    if mark.status != "done" or mark.inputs != surfels_inputs(store, key):
+    if not tile.mark(name).same_work(surfels_mark(store, key)):
         return tile_surfels(store, key)
     kept = tile.read_table(name)
     origin = np.array(store.grid.origin_mm(key), np.int64)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from tilestream.errors import TileNotReadyError, UsageError
 from tilestream.factors.catalogue import COUNTS, CRITERIA, Which, columns_of
-from tilestream.factors.terms import terms_inputs, terms_table, tile_terms
+from tilestream.factors.terms import terms_mark, terms_table, tile_terms
 from tilestream.factors.vicinity import TileTerms, vicinity_sums
 from tilestream.records import Float64, Int64
 from tilestream.sensors import VLP16, Sensor
@@ -90,8 +90,7 @@ class TermsCache:
             return None
         cell_mm = whole_mm(self.cell_size, "cell_size")
         name = terms_table(cell_mm)
-        mark = tile.mark(name)
-        if mark.status == "done" and mark.inputs == terms_inputs(self.store, key, cell_mm):
+        if tile.mark(name).same_work(terms_mark(self.store, key, cell_mm)):
             return TileTerms.from_arrays(tile.read_table(name))
         return tile_terms(self.store, key, self.cell_size)
 

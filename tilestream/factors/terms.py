@@ -14,9 +14,11 @@ from tilestream.kernels.cells import cell_of_points, cell_sums, moments
 from tilestream.kernels.depth_image import thin
 from tilestream.ndt import MIN_POINTS
 from tilestream.records import Cells, Int64
-from tilestream.store import MISSING, POINTS, Tile, TileStore, hash_of
+from tilestream.store import MISSING, POINTS, Mark, Tile, TileStore, hash_of
 from tilestream.tiling import Box, TileKey, whole_mm
 
+TERMS_VERSION = 1
+"""Raise it when the terms that are made from the same points change."""
 DEPTH_MM = 500
 """Edge of the voxels to which map points are thinned for the depth image [mm]."""
 REACH_MM = 10_000
@@ -55,6 +57,12 @@ def terms_inputs(
     if have is not None:
         return hash_of([(str(near), have.get(near, MISSING.identity)) for near in keys])
     return hash_of([(str(near), Tile(store, near).mark(POINTS).identity) for near in keys])
+
+
+def terms_mark(store: TileStore, key: TileKey, cell_mm: int) -> Mark:
+    """The mark of the terms that are made from the store's points by this code."""
+    inputs = terms_inputs(store, key, cell_mm)
+    return Mark("done", inputs=inputs, settings=hash_of(cell_mm, TERMS_VERSION))
 
 
 def terms_of(cells: Cells, points_mm: Int64, core: Box, depth_mm: Int64 | None = None) -> TileTerms:
