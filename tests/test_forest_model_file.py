@@ -305,5 +305,5 @@ def test_the_default_model_is_tuned_and_calibrated() -> None:
     assert made.facts["recipe"] == "default"
     assert made.facts["log"]
     assert made.interval.blocks == 2
-    assert made.interval.level == pytest.approx(2 / 3)
+    assert made.interval.level == 0.9
     assert made.interval.factor > 1.0

@@ -34,8 +34,8 @@ WORST = 0.75
 """Places whose estimate is above this quantile of the training labels are given a reason."""
 PREDICTION_COLUMNS = (
     Column("estimate", "label", "m", "Estimated error_mean.", "definitions, section 6"),
-    Column("low", "label", "m", "Lower end of its interval.", "conformal by blocks"),
-    Column("high", "label", "m", "Upper end of its interval.", "conformal by blocks"),
+    Column("low", "label", "m", "Lower end of its interval.", "calibrated by blocks"),
+    Column("high", "label", "m", "Upper end of its interval.", "calibrated by blocks"),
     Column("p_fail", "label", "1", "Estimated share of starts that fail.", "definitions, 5"),
     Column("floor", "label", "m", "Estimated error_floor.", "definitions, section 5"),
     Column("tail", "label", "m", "Estimated error_tail.", "definitions, section 5"),
@@ -141,7 +141,12 @@ def train(
 
 
 def _interval(dataset: Dataset, recipe: Recipe, seed: int, n_jobs: int | None) -> Interval:
-    """The interval, from what forests say of blocks that they have not seen."""
+    """The interval, from what forests say of blocks that they have not seen.
+
+    The recipe was chosen on these blocks too, so the interval is a little narrower than one whose
+    recipe had been chosen anew for each fold: one of three recipes, judged on all blocks, is all
+    that a held-out block has told.
+    """
     try:
         splits = block_splits(dataset)
     except ModelError:
