@@ -28,12 +28,15 @@ from report_findings import (
 from report_json import sources
 
 from tilestream.errors import CrsError, TileNotReadyError, UsageError
+from tilestream.factors import catalogue, observability
+from tilestream.forest.dataset import SPREAD_ACROSS, SPREAD_ALONG, WEAK_ALONG
 from tilestream.formats import open_source
 from tilestream.records import Float64
-from tilestream.report import Findings, exceeds, write_report
+from tilestream.report import Findings, gate, write_report
 from tilestream.report.charts import MOST, city_map
 from tilestream.report.colours import MISSING, STEPS, palette, scale_of
-from tilestream.report.judgement import joined, reaches, segments, worst_places
+from tilestream.report.exports import write_geoparquet
+from tilestream.report.judgement import BRIDGE, reaches, segments, worst_places
 from tilestream.report.summary import plain, with_gaps
 
 FILES = (
@@ -124,6 +127,23 @@ def test_geoparquet_is_read_by_its_own_rules(found: Findings, folder: Path) -> N
     assert table.schema.field("feature_count").metadata[b"unit"] == b"1"
 
 
+def test_every_column_of_the_places_says_what_it_means(tmp_path: Path) -> None:
+    columns = [*catalogue.COLUMNS, *observability.COLUMNS, WEAK_ALONG, SPREAD_ALONG, SPREAD_ACROSS]
+    places = places_of({"a": 3})
+    for column in columns:
+        if column.name not in places:
+            places[column.name] = 1.0
+    write_geoparquet(tmp_path / "places.parquet", Findings("t", places))
+    schema = pq.read_schema(tmp_path / "places.parquet")
+    assert {"ob_info_along", "vd_mean", "heading", "route_id"} <= set(schema.names)
+    for field in schema:
+        if field.name != "geometry":
+            assert field.metadata[b"meaning"], field.name
+            assert b"unit" in field.metadata, field.name
+    units = {name: schema.field(name).metadata[b"unit"] for name in ("vd_mean", "heading", "x")}
+    assert units == {"vd_mean": b"m", "heading": b"rad", "x": b"m"}
+
+
 def test_geoparquet_of_a_local_frame_says_that_its_crs_is_unknown(tmp_path: Path) -> None:
     lost = without_labels()
     places = lost.places.copy()
@@ -157,6 +177,9 @@ def test_geojson_has_the_segments_in_degrees(found: Findings, folder: Path) -> N
         np.testing.assert_allclose(np.column_stack([x, y]), part[["x", "y"]], atol=1e-3)
         said = feature["properties"]
         assert said["worst"] == part["estimate"].max()
+        worst = part.loc[part["estimate"].idxmax()]
+        for name in ("along", "across", "up", "floor", "tail"):
+            assert said[name] == worst[name]
         assert said["mean"] == pytest.approx(part["estimate"].mean())
         assert said["p_fail"] == part["p_fail"].max()
         assert said["reason"] == "few features in view"
@@ -220,31 +243,55 @@ def routes_with_gaps(draw: st.DrawFn) -> pd.DataFrame:
 
 
 def literal_segments(places: pd.DataFrame, threshold: float) -> list[list[tuple[str, int]]]:
+    """Row by row: what is over begins or prolongs a run, what is not waits to be bridged."""
     runs: list[list[tuple[str, int]]] = []
-    for route, sample, estimate in zip(
-        places["route_id"], places["sample"], places["estimate"], strict=True
-    ):
-        if not estimate > threshold:
+    waiting: list[tuple[str, int]] = []
+    last: tuple[str, int, float] | None = None
+    for row in places.itertuples():
+        name = (row.route_id, row.sample)
+        if not row.estimate > threshold:
+            waiting.append(name)
             continue
-        if runs and runs[-1][-1] == (route, sample - 1):
-            runs[-1].append((route, sample))
+        near = (
+            last is not None
+            and last[0] == row.route_id
+            and (row.arc_length - last[2] <= BRIDGE or row.sample == last[1] + 1)
+        )
+        if near:
+            runs[-1] += [*waiting, name]
         else:
-            runs.append([(route, sample)])
+            runs.append([name])
+        waiting, last = [], (row.route_id, row.sample, row.arc_length)
     return runs
 
 
 @settings(max_examples=60, deadline=None)
-@given(routes_with_gaps())
-def test_segments_are_the_runs_over_the_threshold(places: pd.DataFrame) -> None:
-    places = Findings("t", places).places
+@given(routes_with_gaps(), st.sampled_from([1.0, 3.0, 8.0]))
+def test_segments_are_the_stretches_over_the_threshold(
+    places: pd.DataFrame, spacing: float
+) -> None:
+    places = Findings("t", places.assign(arc_length=spacing * places["arc_length"])).places
     runs = segments(places, 0.25)
     names = list(zip(places["route_id"], places["sample"], strict=True))
     assert [[names[row] for row in run] for run in runs] == literal_segments(places, 0.25)
     union = np.concatenate(runs) if runs else np.zeros(0, np.int64)
-    np.testing.assert_array_equal(union, np.flatnonzero(places["estimate"] > 0.25))
+    over = (places["estimate"] > 0.25).to_numpy()
+    assert len(np.unique(union)) == len(union)
+    assert set(np.flatnonzero(over)) <= set(union)
     for run in runs:
-        assert (np.diff(run) == 1).all()
-        assert joined(places)[run[:-1]].all()
+        assert over[[run[0], run[-1]]].all()
+        assert len(set(places["route_id"].iloc[run])) == 1
+
+
+def test_a_dip_of_a_few_metres_does_not_split_a_stretch(tmp_path: Path) -> None:
+    estimate = np.full(40, 0.1)
+    estimate[[5, 6, 10, 20, 26]] = 0.3  # 4 m apart, 10 m apart, 6 m apart
+    estimate[8] = np.nan
+    places = places_of({"a": 40}).assign(estimate=estimate)
+    assert [run.tolist() for run in segments(places, 0.25)] == [list(range(5, 11)), [20], [26]]
+    content = write_report(Findings("t", places), tmp_path)
+    assert content["segments"][0]["worst"] == 0.3
+    assert content["segments"][0]["mean"] == pytest.approx((3 * 0.3 + 2 * 0.1) / 5)
 
 
 @settings(max_examples=30, deadline=None)
@@ -271,15 +318,32 @@ def test_the_worst_places_are_different_places(found: Findings) -> None:
         assert np.linalg.norm(at[rows] - at[row], axis=1).min() < 30.0 or row in rows
 
 
-def test_a_gate_closes_above_the_limit_only(found: Findings) -> None:
-    highest = float(found.places["estimate"].max())
-    assert exceeds(found.places, highest - 1e-6)
-    assert not exceeds(found.places, highest)
-    with pytest.raises(UsageError, match="nothing can be judged"):
-        exceeds(nothing_estimated().places, 0.25)
+def test_a_gate_closes_above_the_limit(found: Findings) -> None:
+    places = found.places[found.places["estimate"].notna()]
+    highest = float(places["estimate"].max())
+    assert gate(places, highest) == []
+    (closed,) = gate(places, highest - 1e-6)
+    worst = places.loc[places["estimate"].idxmax()]
+    assert f"1 of {len(places)} sample points are estimated above" in closed
+    assert f"on {worst['route_id']} at {worst['arc_length']:.0f} m" in closed
     for limit in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(UsageError, match="threshold"):
-            exceeds(found.places, limit)
+            gate(places, limit)
+
+
+def test_a_gate_closes_where_too_little_is_known() -> None:
+    places = places_of({"a": 60, "b": 40}).assign(estimate=0.1)
+    few = places.assign(estimate=places["estimate"].where(places["sample"] > 4))
+    assert few["estimate"].isna().sum() == 10
+    assert gate(places, 0.25) == []
+    (many,) = gate(few, 0.25)
+    assert "10 of 100 sample points have no estimate, more than 5%" in many
+    allowed = places.assign(estimate=places["estimate"].where(places.index > 4))
+    assert allowed["estimate"].isna().sum() == 5
+    assert gate(allowed, 0.25) == []
+    blind = pd.concat([places, places_of({"c": 2}).assign(estimate=np.nan)], ignore_index=True)
+    assert gate(blind, 0.25) == ["no estimate at all on c"]
+    assert len(gate(nothing_estimated().places, 0.25)) == 2
 
 
 def test_neither_order_nor_repetition_changes_a_byte(

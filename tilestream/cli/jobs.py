@@ -10,7 +10,7 @@ import typer
 
 from tilestream.cli.cluster import ALL_CORES, HERE, AllCores, Cluster, on_cluster
 from tilestream.cli.options import AsJson, Changes, Config, DryRun
-from tilestream.cli.printing import out, print_json, say
+from tilestream.cli.printing import err, out, print_json, say
 from tilestream.cli.progress import progress
 from tilestream.cli.tables import forecast_rows, forecast_table, plan_table, report_table
 from tilestream.dataflow import main_job
@@ -18,7 +18,8 @@ from tilestream.dataflow import simulate as simulation
 from tilestream.dataflow.main_forecast import forecast
 from tilestream.dataflow.run_settings import RunSettings, read_settings
 from tilestream.errors import LimitError
-from tilestream.report import cards, exceeds
+from tilestream.report import cards, gate
+from tilestream.report.judgement import MISSING, check_threshold
 from tilestream.simulation.settings import load_preset
 
 SHIPPED = resources.files("tilestream") / "data"
@@ -34,13 +35,19 @@ def run(
     config: Config,
     changes: Changes = [],  # noqa: B006 - typer's way to say none
     fail_over: Annotated[
-        float | None, typer.Option(help="Exit with 1 if any estimate is above this [m].")
+        float | None,
+        typer.Option(
+            help="Exit with 1 if any estimate is above this [m], if a route has no estimate at "
+            f"all, or if more than {MISSING:.0%} of the places have none."
+        ),
     ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="As `plan`.")] = False,
     as_json: AsJson = False,
     cluster: Cluster = ALL_CORES,
 ) -> None:
     """The main job: from map and drives to the estimated error everywhere, and its report."""
+    if fail_over is not None:
+        check_threshold(fail_over)
     if dry_run:
         plan(config, changes, as_json=as_json)
         return
@@ -69,26 +76,36 @@ def show_report(folder: Path) -> None:
     """Print the headline of a report and where it is."""
     report = report_of(folder)
     out.print(report_table(report, cards(report)))
+    for line in lost_labels(folder):
+        say(line)
     say(f"The report is at {(folder / 'report' / 'index.html').absolute()}")
 
 
+def lost_labels(folder: Path) -> list[str]:
+    """A line on the measured places that no model could learn from, by reason; none: nothing."""
+    run = json.loads((folder / "run.json").read_text())
+    lost: dict[str, int] = run.get("lost_labels", {})
+    if not lost:
+        return []
+    most_first = sorted(lost.items(), key=lambda item: (-item[1], item[0]))
+    reasons = ", ".join(f"{count:,} {reason}" for reason, count in most_first)
+    total = sum(lost.values())
+    return [f"{total:,} of {total + run['labelled']:,} measured places are not used: {reasons}"]
+
+
 def judge_over(folder: Path, limit: float) -> None:
-    """Fail where the estimated error is too large: a gate for a map release.
+    """Fail where the estimated error is too large, or not known: a gate for a map release.
 
     Raises:
-        LimitError: an estimate is above the limit; says how many and the worst.
+        LimitError: the gate is closed; says why (`gate`).
     """
-    places = pd.read_csv(folder / "report" / "places.csv")
-    if exceeds(places, limit):
-        over = places[places["estimate"] > limit].nlargest(1, "estimate")
-        count = int((places["estimate"] > limit).sum())
-        where = [
-            f"{r.estimate:.2f} m on {r.route_id} at {r.arc_length:.0f} m" for r in over.itertuples()
-        ]
-        raise LimitError(
-            f"{count} of {len(places)} sample points are estimated above {limit:g} m, the worst "
-            f"{''.join(where)}"
-        )
+    needed = ["route_id", "arc_length", "estimate"]
+    places = pd.read_parquet(folder / "report" / "places.parquet", columns=needed)
+    missing = int(places["estimate"].isna().sum())
+    say(f"{missing:,} of {len(places):,} sample points have no estimate", to=err)
+    closed = gate(places, limit)
+    if closed:
+        raise LimitError("; ".join(closed))
 
 
 def plan(

@@ -16,18 +16,18 @@ from tilestream.dataflow.estimate_tasks import (
 )
 from tilestream.dataflow.localize_tasks import box_around
 from tilestream.dataflow.plan import Task
+from tilestream.dataflow.run_settings import ModelSettings
 from tilestream.errors import ModelError
-from tilestream.forest.dataset import Dataset
+from tilestream.forest.dataset import TARGETS, Dataset
 from tilestream.forest.evaluation import ceiling, factor_sets, figures_by_protocol
 from tilestream.forest.intervals import coverage
-from tilestream.forest.training import PREDICTION_COLUMNS
+from tilestream.forest.training import MAIN, PREDICTION_COLUMNS
 from tilestream.records import Float64
 from tilestream.report.findings import AROUND, Findings
 from tilestream.store import POINTS, Tile, TileStore
 from tilestream.tables import read_tables
 
 PLACE = ["route_id", "sample"]
-MAIN = "error_mean"
 
 
 @dataclass(frozen=True)
@@ -90,11 +90,14 @@ def labels_of(
 
 
 def evaluation_of(
-    found: Mapping[tuple[str, str, str], Mapping[str, pd.DataFrame | str]], whole: str
+    found: Mapping[tuple[str, str, str], Mapping[str, pd.DataFrame | str]], whole: str, recipe: str
 ) -> dict[str, pd.DataFrame]:
     """Judgements as tables: `protocols`, `table_iv`, `coverage`, and `parts` for other targets.
 
-    `whole` is what the set of all factors is called.
+    Args:
+        found: what was judged (`Done.judgements`).
+        whole: what the set of all factors is called.
+        recipe: the model whose intervals are checked.
     """
     rows = {key: figures_by_protocol(judgement, key[1]) for key, judgement in found.items()}
     protocols = [
@@ -106,7 +109,7 @@ def evaluation_of(
         if target == MAIN and (chosen or model in ("paper", "default"))
     ]
     parts = [table.assign(target=t) for (t, _, _), table in rows.items() if t != MAIN]
-    held = found.get((MAIN, "default", ""), {}).get("path", "")
+    held = found.get((MAIN, recipe, ""), {}).get("path", "")
     return {
         "protocols": _joined(protocols),
         "table_iv": _joined(sets),
@@ -138,17 +141,22 @@ def findings_of(
     dataset: Dataset | None,
     facts: Mapping[str, Any],
     *,
-    trained_here: bool,
+    model: ModelSettings,
 ) -> tuple[Findings, dict[str, Any]]:
-    """All that the report tells, and the figures of the evaluation for machines."""
+    """All that the report tells, and the figures of the evaluation for machines.
+
+    Held-out estimates are those of the model's own recipe; of a model that was not trained on these
+    labels all estimates are held out as they are.
+    """
     places, found = places_of(done), done.judgements()
     whole = "" if dataset is None else list(factor_sets(dataset.columns))[-1]
-    tables = evaluation_of(found, whole)
-    held = found.get((MAIN, "default", ""), {}).get("path")
+    tables = evaluation_of(found, whole, model.recipe)
+    held = found.get((MAIN, model.recipe, ""), {}).get("path")
     points = held if isinstance(held, pd.DataFrame) else None
     weights = [task.out for task in done.estimate if isinstance(task, WeighTask)]
     weighed = read_tables(weights) if weights else pd.DataFrame({"factor": []})
-    ceiling_of = ceilings(dataset, (MAIN, "error_tail", "p_fail", "error_floor"))
+    ceiling_of = ceilings(dataset, TARGETS)
+    trained_here = model.use is None and model.recipe != "physics"
     gathered = Findings(
         title=title,
         places=places,
@@ -160,7 +168,9 @@ def findings_of(
         importances=weighed[weighed["factor"] != ""].reset_index(drop=True),
         criterion_importances=weighed[weighed["factor"] == ""].reset_index(drop=True),
         coverage=tables["coverage"],
-        ceiling=ceiling_of.get(MAIN),
+        parts=tables["parts"],
+        ceilings=ceiling_of,
+        model="" if model.use else model.recipe,
         facts=dict(facts),
         crs=store.settings.crs,
         around=lambda x, y, _: points_around(store, x, y, AROUND),

@@ -272,7 +272,7 @@ def _report(
         read.store,
         known,
         facts,
-        trained_here=settings.model.use is None,
+        model=settings.model,
     )
     text = json.dumps(_plain(evaluation), indent=1, allow_nan=False)
     _write_text(settings.folder / "tables" / "evaluation.json", text + "\n")

@@ -7,8 +7,8 @@ findings --> judgement (segments, worst places) --> summary --+--> exports (parq
 """
 
 from tilestream.report.findings import Findings
-from tilestream.report.judgement import exceeds
+from tilestream.report.judgement import gate
 from tilestream.report.places import cards
 from tilestream.report.write import write_report
 
-__all__ = ["Findings", "cards", "exceeds", "write_report"]
+__all__ = ["Findings", "cards", "gate", "write_report"]

@@ -1,5 +1,6 @@
 """The charts that answer to the mouse: Bokeh documents as plain JSON, the same bytes every time."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,8 +23,8 @@ from tilestream.records import Float64
 from tilestream.report.colours import ACTUAL, AGAIN, HELD_OUT, MISSING, palette, scale_of
 from tilestream.report.findings import Findings, estimates
 from tilestream.report.judgement import worst_places
-from tilestream.report.summary import held_out_along, interval_factor, with_gaps
-from tilestream.report.words import CM_PER_M, length, percent, span
+from tilestream.report.summary import AXES, STARTS, held_out_along, interval_factor, with_gaps
+from tilestream.report.words import CM_PER_M, length, lengths, percent, span
 
 MOST = 20_000
 """Places drawn on the map; of more, the worst of every few along a route."""
@@ -39,7 +40,7 @@ MAP_TIP = (
     '<div style="max-width:24em;font:13px system-ui,sans-serif;color:#222">'
     "<b>@route</b>, @arc{0.0} m along<br>"
     "estimate <b>@shown</b><br>interval @interval<br>starts that fail: @fail<br>"
-    "like the training places: @domain<br><i>@reason</i></div>"
+    "@axes<br>@starts<br>like the training places: @domain<br><i>@reason</i></div>"
 )
 
 
@@ -124,7 +125,8 @@ def _columns(places: pd.DataFrame, rows: NDArray[np.int64], origin: Float64) -> 
     part = places.iloc[rows]
     estimate = estimates(part)
     share = np.clip(scale_of(estimates(places)).step(estimate), 0, None) / 255.0
-    value = {name: part[name].to_numpy(np.float64) for name in ("low", "high", "p_fail")}
+    names = ("low", "high", "p_fail", *AXES, *STARTS)
+    value = {name: part[name].to_numpy(np.float64) for name in names}
     return {
         "x": part["x"].to_numpy(np.float64) - origin[0],
         "y": part["y"].to_numpy(np.float64) - origin[1],
@@ -135,12 +137,20 @@ def _columns(places: pd.DataFrame, rows: NDArray[np.int64], origin: Float64) -> 
         "shown": [length(e) for e in estimate],
         "interval": [span(lo, hi) for lo, hi in zip(value["low"], value["high"], strict=True)],
         "fail": [percent(p) for p in value["p_fail"]],
+        "axes": _told(value, AXES),
+        "starts": _told(value, STARTS),
         "domain": [
             ("yes" if like else "no") if known else "not known"
             for like, known in zip(part["in_domain"], np.isfinite(estimate), strict=True)
         ],
         "reason": part["reason"].fillna("").astype(str).tolist(),
     }
+
+
+def _told(value: Mapping[str, Float64], names: Sequence[str]) -> list[str]:
+    """Lengths of each place in words."""
+    rows = zip(*(value[name] for name in names), strict=True)
+    return [lengths(dict(zip(names, row, strict=True))) for row in rows]
 
 
 def _number_the_worst(plot: figure, places: pd.DataFrame, origin: Float64) -> None:

@@ -62,6 +62,16 @@ PROTOCOL_NAMES = {
     "path": "leave one path out",
     "blocks": "held-out blocks",
 }
+PARTS = {
+    "error_tail": "tail: what starts farther than 1 m add",
+    "error_floor": "floor: what starts within 1 m end with",
+    "along_mean": "along the road",
+    "across_mean": "across the road",
+    "up_mean": "in height",
+    "p_fail": "share of the starts that fail",
+}
+"""The targets beside the mean error, in words."""
+AGAIN = "a second drive over the same places"
 FIGURES = ("MAE", "RMSE", "&lt; 2.5 cm", "&lt; 5 cm", "R²", "skill", "Spearman")
 LEAKING = "paper"
 """The protocol whose figures prove nothing."""
@@ -170,17 +180,49 @@ def protocols(found: Findings) -> str:
     if found.protocols.empty:
         why = "There were no labels, so nothing can be judged: the estimates rest on the model."
         return section("protocols", "How good the estimates are", meaning, empty(why))
-    parts = [_protocol(name, rows) for name, rows in _by_protocol(found.protocols)]
-    if found.ceiling is None:
+    parts = [_protocol(name, rows, found.model) for name, rows in _by_protocol(found.protocols)]
+    if "error_mean" not in found.ceilings:
         parts.append(empty("No place was driven twice in this run, so no ceiling is known."))
     else:
-        cells = [["a second drive over the same places", *_figures(found.ceiling)]]
+        cells = [[AGAIN, *_figures(found.ceilings["error_mean"])]]
         text = "<p>Two measurements of one place differ by this much: no map can tell more.</p>"
         parts.append(f"<h3>the ceiling</h3>{text}" + table(["", *FIGURES], cells, "figures"))
+    parts.append(_parts(found))
     return section("protocols", "How good the estimates are", meaning, "".join(parts))
 
 
-def _protocol(name: str, rows: list[dict[str, Any]]) -> str:
+def _parts(found: Findings) -> str:
+    """How well the parts of the error are estimated on paths left out, beside a repeated drive."""
+    title = "<h3>the parts of the error, on paths left out</h3>"
+    rows = [row for name, rows in _by_protocol(found.parts) if name == "path" for row in rows]
+    judged = [row for row in rows if _judged(row)]
+    if not judged:
+        why = esc(rows[0].get("reason") or "no reason given") if rows else "nothing judged them"
+        return title + empty(f"Not judged in this run: {why}.")
+    groups = []
+    for target, meaning in PARTS.items():
+        cells = [
+            [_model(row["model"]), *_of_part(target, row)]
+            for row in judged
+            if row["target"] == target
+        ]
+        if cells and target in found.ceilings:
+            cells.append([AGAIN, *_of_part(target, found.ceilings[target])])
+        if cells:
+            groups.append((meaning, cells))
+    text = (
+        "<p>The skill is that over the training median; a part that a second drive cannot tell "
+        "either is chance, not the map's.</p>"
+    )
+    return title + text + grouped_table(["part", "MAE", "skill", "Spearman"], groups, "figures")
+
+
+def _of_part(target: str, row: Mapping[str, Any]) -> list[str]:
+    error = percent(row["mae"], 2) if target == "p_fail" else length(row["mae"], 2)
+    return [error, plain_number(row.get("skill")), plain_number(row.get("spearman"))]
+
+
+def _protocol(name: str, rows: list[dict[str, Any]], model: str) -> str:
     meaning = next((p.meaning for p in PROTOCOLS if p.name == name), "")
     text = f"<h3>{_protocol_name(name)}</h3><p>{esc(meaning)} "
     judged = [r for r in rows if _judged(r)]
@@ -200,25 +242,33 @@ def _protocol(name: str, rows: list[dict[str, Any]]) -> str:
     rest = [r for r in judged if r["model"] not in {*OURS, *OTHERS, *OPPONENTS}]
     if rest:
         groups.append(("others", [[_model(r["model"]), *_figures(r)] for r in rest]))
-    verdict = "" if name == LEAKING else _verdict(judged)
+    verdict = "" if name == LEAKING else _verdict(judged, model)
     return f"{text}{verdict}</p>" + grouped_table(head, groups, "figures")
 
 
-def _verdict(judged: list[dict[str, Any]]) -> str:
-    """Whether the best of our models beats the best opponent, by mean absolute error."""
-    ours = [r for r in judged if r["model"] in OURS]
-    opponents = [r for r in judged if r["model"] in OPPONENTS]
-    if not (ours and opponents):
+def _verdict(judged: list[dict[str, Any]], model: str) -> str:
+    """Whether the model that made the estimates beats the best opponent, by mean absolute error;
+    and which of ours is better than it.
+    """
+    errors = {str(r["model"]): float(r["mae"]) for r in judged}
+    opponents = [name for name in errors if name in OPPONENTS]
+    if model not in errors or not opponents:
         return ""
-    best = min(ours, key=lambda r: float(r["mae"]))
-    rival = min(opponents, key=lambda r: float(r["mae"]))
-    wins = best["mae"] < rival["mae"]
-    return (
-        f"<b>The best of ours ({length(best['mae'], 2)}, {_model(best['model'])}) "
-        f"{'beats' if wins else 'does not beat'} "
-        f"the best opponent ({length(rival['mae'], 2)}, {_model(rival['model'])})</b> by mean "
-        f"absolute error, over {count(best['points'])} points."
+    rival = min(opponents, key=lambda name: errors[name])
+    points = next(r["points"] for r in judged if r["model"] == model)
+    text = (
+        f"<b>The model of these estimates ({length(errors[model], 2)}, {_model(model)}) "
+        f"{'beats' if errors[model] < errors[rival] else 'does not beat'} "
+        f"the best opponent ({length(errors[rival], 2)}, {_model(rival)})</b> by mean "
+        f"absolute error, over {count(points)} points."
     )
+    best = min((name for name in errors if name in OURS), key=lambda name: errors[name])
+    if errors[best] < errors[model]:
+        text += (
+            f" Better here than the model in use: {_model(best)} ({length(errors[best], 2)}; "
+            f"<code>model.recipe: {best}</code>)."
+        )
+    return text
 
 
 def _model(name: object) -> str:
@@ -263,8 +313,9 @@ def _figures(row: Mapping[str, Any]) -> list[str]:
 def calibration(found: Findings) -> str:
     """Whether intervals hold what they promise, path by path."""
     meaning = (
-        "An interval that promises nine of ten must hold nine of ten on a path that it was not "
-        "calibrated on; the bar is what it held, the line what was promised."
+        "An interval that promises nine of ten is to hold nine of ten on paths that it was not "
+        "calibrated on: fewer is too narrow, more is wider than need be. The bar is what it held, "
+        "the line what was promised."
     )
     if found.coverage.empty:
         why = "Without labels on several paths no interval can be checked."
@@ -281,11 +332,21 @@ def calibration(found: Findings) -> str:
         for r in _records(found.coverage)
     ]
     head = ["path", "points", "promised", "held", "", "from estimate / f to estimate × f"]
-    judged = [r for r in _records(found.coverage) if known(r["covered"])]
-    held = sum(r["covered"] >= r["level"] for r in judged)
-    verdict = f"<p><b>The promise was held on {held} of {len(judged)} paths.</b></p>"
-    body = (verdict if judged else "") + table(head, rows, "bars")
+    body = _promise(found.coverage) + table(head, rows, "bars")
     return section("calibration", "Do the intervals hold", meaning, body)
+
+
+def _promise(coverage: pd.DataFrame) -> str:
+    """What was promised and what was held, every point counting the same; "" if none is judged."""
+    judged = coverage[coverage["covered"].notna()]
+    if judged.empty:
+        return ""
+    held = float((judged["covered"] * judged["points"]).sum() / judged["points"].sum())
+    low, high = float(judged["covered"].min()), float(judged["covered"].max())
+    return (
+        f"<p><b>Promised {percent(judged['level'].mean(), 0)}, held {percent(held)} on average, "
+        f"{percent(low)} to {percent(high)} by path.</b></p>"
+    )
 
 
 def _gauge(covered: Any, level: Any) -> str:

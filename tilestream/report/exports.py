@@ -14,7 +14,8 @@ from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 
 from tilestream.errors import CrsError
-from tilestream.factors.catalogue import COLUMNS
+from tilestream.factors import catalogue, observability
+from tilestream.factors.rows import PLACE_COLUMNS
 from tilestream.forest.dataset import SPREAD_ACROSS, SPREAD_ALONG, WEAK_ALONG
 from tilestream.forest.training import PREDICTION_COLUMNS
 from tilestream.formats.pcd import write_pcd
@@ -29,10 +30,18 @@ GEOPARQUET = "1.1.0"
 POINT_Z = 1001
 """ISO WKB code of a point with z."""
 _WKB = np.dtype([("order", "u1"), ("kind", "<u4"), ("xyz", "<f8", 3)])
+_TURNED = (WEAK_ALONG, SPREAD_ALONG, SPREAD_ACROSS)
 _CATALOGUE = {
     column.name: column
-    for column in (*COLUMNS, WEAK_ALONG, SPREAD_ALONG, SPREAD_ACROSS, *PREDICTION_COLUMNS)
+    for column in (
+        *PLACE_COLUMNS,
+        *catalogue.COLUMNS,
+        *_TURNED,
+        *observability.COLUMNS,
+        *PREDICTION_COLUMNS,
+    )
 }
+"""What each column of the places means."""
 
 
 def write_text(path: Path, text: str) -> None:
@@ -53,6 +62,8 @@ def write_csv(path: Path, places: pd.DataFrame) -> None:
 
 def write_geoparquet(path: Path, found: Findings) -> None:
     """Write the places as GeoParquet 1.1: a WKB point each, null where a coordinate is missing.
+
+    Every column of ours carries its unit, meaning and source.
 
     Raises:
         CrsError: a CRS that pyproj does not know.

@@ -43,7 +43,9 @@ class Findings:
     that model has an interval of its own; else it is the factor of `coverage`.
     A row that repeats another in every column counts once."""
     protocols: pd.DataFrame = field(default_factory=_none)
-    """`evaluation.compare`."""
+    """`evaluation.compare` of the mean error."""
+    parts: pd.DataFrame = field(default_factory=_none)
+    """The same of the parts of the error, with the column `target`."""
     table_iv: pd.DataFrame = field(default_factory=_none)
     """`evaluation.table_iv`."""
     importances: pd.DataFrame = field(default_factory=_none)
@@ -52,8 +54,11 @@ class Findings:
     """`evaluation.criterion_importances`."""
     coverage: pd.DataFrame = field(default_factory=_none)
     """`intervals.coverage`."""
-    ceiling: dict[str, float] | None = None
-    """The fields of `evaluation.ceiling`'s figures; None without a repeated drive."""
+    ceilings: dict[str, dict[str, float]] = field(default_factory=dict)
+    """The fields of `evaluation.ceiling`'s figures by target; empty without a repeated drive."""
+    model: str = "default"
+    """Which of the models of `protocols` has made the estimates; one that is not among them was
+    trained elsewhere."""
     facts: dict[str, Any] = field(default_factory=dict)
     """Run facts by name; a dictionary among them becomes a table of its own. `notes` and
     `attributions` are lists of sentences."""

@@ -12,23 +12,49 @@ WORST = 10
 """How many of the worst places are shown."""
 APART = 30.0
 """Least distance between two of them [m]: nearer ones are the same place twice."""
+BRIDGE = 5.0
+"""Places over the threshold this near along a route are one segment, whatever lies between [m]."""
+MISSING = 0.05
+"""Share of the places that may be without an estimate where a gate opens."""
+NAMED = 5
+"""Routes that are named where a gate stays closed."""
 
 
-def exceeds(places: pd.DataFrame, limit: float) -> bool:
-    """Whether any estimate is above a limit: for gates.
+def gate(places: pd.DataFrame, limit: float) -> list[str]:
+    """Why a map does not pass a limit; empty: it passes.
+
+    What is not known does not pass: a route without any estimate fails the gate, and so does a map
+    of which more than `MISSING` of the places have none.
 
     Args:
-        places: `Findings.places`.
+        places: route_id, arc_length [m] and estimate [m] of every sample point.
         limit: greatest estimate that passes [m].
 
     Raises:
-        UsageError: the limit is not positive, or nothing was estimated: that does not pass.
+        UsageError: the limit is not positive.
     """
     check_threshold(limit)
     estimate = estimates(places)
-    if np.isnan(estimate).all():
-        raise UsageError(f"none of {len(places)} places has an estimate: nothing can be judged")
-    return bool((estimate > limit).any())
+    found, total = [], len(places)
+    over = int((estimate > limit).sum())
+    if over:
+        worst = places.iloc[int(np.nanargmax(estimate))]
+        found.append(
+            f"{over} of {total} sample points are estimated above {limit:g} m, the worst "
+            f"{worst['estimate']:.2f} m on {worst['route_id']} at {worst['arc_length']:.0f} m"
+        )
+    known = pd.Series(np.isfinite(estimate)).groupby(places["route_id"].to_numpy(str)).any()
+    blind = known.index[~known].tolist()
+    if blind:
+        more = ", …" if len(blind) > NAMED else ""
+        found.append(f"no estimate at all on {', '.join(blind[:NAMED])}{more}")
+    missing = int(np.isnan(estimate).sum())
+    if missing > MISSING * total:
+        found.append(
+            f"{missing} of {total} sample points have no estimate, more than {MISSING:.0%}; "
+            "report/index.html lists why"
+        )
+    return found
 
 
 def check_threshold(limit: float) -> None:
@@ -61,15 +87,21 @@ def reaches(places: pd.DataFrame) -> Float64:
 
 
 def segments(places: pd.DataFrame, threshold: float) -> list[Int64]:
-    """Rows of each run of consecutive sample points whose estimates exceed the threshold.
+    """Rows of each stretch of road over a threshold, with what it bridges.
+
+    Two places of a route that exceed it belong to one stretch when they are consecutive sample
+    points, or at most `BRIDGE` apart; the places between them, lower or without an estimate, are
+    part of it. A stretch begins and ends with a place over the threshold.
 
     Args:
-        places: `Findings.places`, in order; a missing estimate ends a run.
+        places: `Findings.places`, in order.
         threshold: of the estimate [m].
     """
     over = np.flatnonzero(estimates(places) > threshold)
-    ends = ~joined(places)[over[:-1]] | (np.diff(over) != 1)
-    return [part for part in np.split(over, np.flatnonzero(ends) + 1) if part.size]
+    route, arc = places["route_id"].to_numpy()[over], places["arc_length"].to_numpy()[over]
+    near = (np.diff(arc) <= BRIDGE) | ((np.diff(over) == 1) & joined(places)[over[:-1]])
+    parts = np.split(over, np.flatnonzero(~near | (route[1:] != route[:-1])) + 1)
+    return [np.arange(part[0], part[-1] + 1) for part in parts if part.size]
 
 
 def worst_places(places: pd.DataFrame, count: int = WORST, apart: float = APART) -> list[int]:

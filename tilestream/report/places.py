@@ -7,8 +7,9 @@ from typing import Any
 from tilestream.report.charts import shown_every
 from tilestream.report.colours import CLIP
 from tilestream.report.findings import AROUND, Findings
-from tilestream.report.judgement import APART
+from tilestream.report.judgement import APART, BRIDGE
 from tilestream.report.pictures import ABOVE, BELOW, heights_ramp
+from tilestream.report.summary import AXES, STARTS
 from tilestream.report.words import (
     DASH,
     count,
@@ -16,6 +17,7 @@ from tilestream.report.words import (
     esc,
     known,
     length,
+    lengths,
     percent,
     plain_number,
     road,
@@ -146,7 +148,11 @@ def _segments(content: Mapping[str, Any]) -> str:
     head = ["route", "from, to", "length", "worst", "mean", "starts that fail", "why at its worst"]
     more = len(found) - len(rows)
     note = f"<p>{more} more are in <code>over_threshold.geojson</code>.</p>" if more else ""
-    return title + table(head, rows, "words") + note
+    told = (
+        f"<p>Places over it at most {BRIDGE:.0f} m apart are one stretch; the mean is over all that"
+        " lies in it.</p>"
+    )
+    return title + told + table(head, rows, "words") + note
 
 
 def worst(content: Mapping[str, Any], pictures: Mapping[int, bytes | str]) -> str:
@@ -160,7 +166,7 @@ def worst(content: Mapping[str, Any], pictures: Mapping[int, bytes | str]) -> st
         [
             str(number),
             f"<b>{esc(p['route_id'])}</b>, {p['arc_length']:.0f}\u00a0m along" + _small(_at(p)),
-            f"<b>{length(p['estimate'])}</b>",
+            f"<b>{length(p['estimate'])}</b>" + _parts(p),
             span(p["low"], p["high"]),
             percent(p["p_fail"]),
             "yes" if p["in_domain"] else "no",
@@ -171,7 +177,9 @@ def worst(content: Mapping[str, Any], pictures: Mapping[int, bytes | str]) -> st
     head = ["", "where", "estimate", "interval", "starts that fail", "like training", "why"]
     meaning = (
         f"The highest estimates that lie at least {APART:.0f} m apart, and what drives each of "
-        "them; numbers as on the map."
+        "them; numbers as on the map. Below an estimate are its parts: along and across the road "
+        "and in height; the floor, which starts within 1 m end with, and the tail, which farther "
+        "ones add."
     )
     title = f"The worst {len(rows)} places" if len(rows) > 1 else "The worst place"
     if not rows:
@@ -179,6 +187,11 @@ def worst(content: Mapping[str, Any], pictures: Mapping[int, bytes | str]) -> st
     views = "".join(_view(n, p, pictures) for n, p in enumerate(content["worst"], start=1))
     body = table(head, rows, "words worst") + _HEIGHTS + f'<div class="views">{views}</div>'
     return section("worst", title, meaning, body)
+
+
+def _parts(p: Mapping[str, Any]) -> str:
+    """Of which directions and starts an estimate is made."""
+    return "".join(_small(lengths({name: p[name] for name in kind})) for kind in (AXES, STARTS))
 
 
 def _at(p: Mapping[str, Any]) -> str:

@@ -15,6 +15,8 @@ from tilestream.version import VERSION
 
 THRESHOLDS = (0.05, 0.10, 0.15, 0.20, 0.25, 0.50)
 """Errors that people ask for [m]: the paper's Table I, and around them."""
+AXES, STARTS = ("along", "across", "up"), ("floor", "tail")
+"""The parts of an estimate [m]: by direction; of the starts nearby, and what farther ones add."""
 GAP = 3.0
 """Labels farther apart along a path than this many typical distances are not joined by a line."""
 
@@ -43,7 +45,9 @@ def summary(found: Findings, threshold: float) -> dict[str, Any]:
         "importances": found.importances.to_dict("records"),
         "criterion_importances": found.criterion_importances.to_dict("records"),
         "coverage": found.coverage.to_dict("records"),
-        "ceiling": found.ceiling,
+        "parts": found.parts.to_dict("records"),
+        "ceilings": found.ceilings,
+        "model": found.model,
         "facts": found.facts,
     }
     return dict(plain(content))
@@ -94,9 +98,11 @@ def routes(places: pd.DataFrame, threshold: float) -> list[dict[str, Any]]:
 
 
 def segment(places: pd.DataFrame, rows: Int64) -> dict[str, Any]:
-    """A stretch of road over the threshold: where, how long, how bad, and why at its worst."""
+    """A stretch of road over the threshold: where, how long, how bad. `worst`, the parts of the
+    error and the reason are those of its worst place, `mean` is over all its places.
+    """
     part = places.iloc[rows]
-    worst = part.iloc[int(np.argmax(estimates(part)))]
+    worst = part.iloc[int(np.nanargmax(estimates(part)))]
     return {
         "route_id": str(worst["route_id"]),
         "begin": float(part["arc_length"].iloc[0]),
@@ -106,8 +112,9 @@ def segment(places: pd.DataFrame, rows: Int64) -> dict[str, Any]:
         "worst": float(worst["estimate"]),
         "worst_at": float(worst["arc_length"]),
         "mean": float(part["estimate"].mean()),
+        **{name: float(worst[name]) for name in (*AXES, *STARTS)},
         "p_fail": float(part["p_fail"].max()),
-        "in_domain": bool(part["in_domain"].all()),
+        "in_domain": bool(part.loc[part["estimate"].notna(), "in_domain"].all()),
         "reason": str(worst["reason"] or ""),
     }
 
