@@ -3,7 +3,6 @@
 from fractions import Fraction
 from pathlib import Path
 
-import interpreted
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -45,6 +44,7 @@ def literal_moments(points_mm: Ints) -> tuple[list[float], list[list[float]]]:
 # --- Sums, mean, covariance
 
 
+@pytest.mark.interpreted
 @given(st.integers(0, 2**32), st.sampled_from([1, 7, 200, 2000, 12345]), st.integers(0, 300))
 @settings(max_examples=40, deadline=None)
 def test_sums_are_those_of_a_plain_loop(seed: int, edge: int, n: int) -> None:
@@ -62,6 +62,7 @@ def test_sums_are_those_of_a_plain_loop(seed: int, edge: int, n: int) -> None:
     assert sums.tolist() == [expected[v] for v in sorted(expected)]
 
 
+@pytest.mark.interpreted
 def test_voxels_at_lattice_planes_far_out_are_exact() -> None:
     for edge in (1, 3, 200, 2000, 999_983):
         planes = np.array([-(10**11), -(10**6), -1, 0, 1, 10**6, 10**11]) // edge * edge
@@ -72,6 +73,7 @@ def test_voxels_at_lattice_planes_far_out_are_exact() -> None:
         assert sums[:, kernels.COUNT].sum() == len(points)
 
 
+@pytest.mark.interpreted
 @given(st.integers(0, 2**32), st.sampled_from([50, 2000, 100_000]))
 @settings(max_examples=25, deadline=None)
 def test_moments_are_those_of_exact_fractions(seed: int, edge: int) -> None:
@@ -181,6 +183,7 @@ def random_covariances(n: int, seed: int = 0) -> Floats:
     return (matrices + matrices.transpose(0, 2, 1)) / 2
 
 
+@pytest.mark.interpreted
 def test_eigenvalues_are_those_of_lapack() -> None:
     covariance = random_covariances(400)
     values, vectors = kernels.eigen(covariance)
@@ -195,6 +198,7 @@ def test_eigenvalues_are_those_of_lapack() -> None:
     assert np.abs(eye - np.eye(3)).max() < 5e-15
 
 
+@pytest.mark.interpreted
 @pytest.mark.parametrize("lam", [(0, 0, 0), (1, 0, 0), (0, 0, 2), (1, 1, 0), (3, 3, 3), (1, 2, 3)])
 def test_eigenvalues_of_diagonal_matrices_are_exact(lam: tuple[int, int, int]) -> None:
     values, vectors = kernels.eigen(np.diag(np.array(lam, float))[None])
@@ -215,6 +219,7 @@ def test_the_normal_of_flat_ground_points_up() -> None:
     assert cells.eigenvalues[0, 2] == 0.0
 
 
+@pytest.mark.interpreted
 @pytest.mark.parametrize(
     ("along", "normal"), [((0, 0, 1), (1, 0, 0)), ((1, 0, 0), (0, 1, 0)), ((0, 1, 0), (1, 0, 0))]
 )
@@ -245,6 +250,7 @@ def test_a_wall_has_one_normal_whatever_its_cells(angle_deg: int) -> None:
     assert np.abs(np.abs(normal) - true).max() < 5e-3
 
 
+@pytest.mark.interpreted
 def test_the_regularised_covariance_has_its_floors_and_its_inverse() -> None:
     covariance = random_covariances(200, seed=9)
     values, vectors = kernels.eigen(covariance)
@@ -359,9 +365,3 @@ def test_no_points_are_no_cells() -> None:
     assert cells.eigenvalues.shape == (0, 3)
     assert cells.normal.shape == (0, 3)
     assert cells.regularised.shape == (0, 3, 3)
-
-
-@interpreted.outer
-def test_the_kernels_are_the_same_without_the_compiler() -> None:
-    chosen = "plain_loop or lapack or diagonal or floors or pole or lattice_planes or fractions"
-    assert interpreted.passed(__file__, chosen) == 14

@@ -2,7 +2,6 @@
 
 from itertools import combinations, pairwise
 
-import interpreted
 import numpy as np
 import pytest
 from hypothesis import given
@@ -114,6 +113,7 @@ def test_neighbours_are_the_cells_within_the_radius(
         )
 
 
+@pytest.mark.interpreted
 def test_a_neighbour_at_the_radius_counts() -> None:
     index = np.array([[0, 0, 0], [1, 2, 0], [2, 0, 0]])
     mean = np.array([[0.5, 0.5, 0.5], [3.5, 4.5, 0.5], [5.500001, 0.5, 0.5]])
@@ -142,6 +142,7 @@ def test_no_cells_have_no_neighbours() -> None:
     assert len(near) == 0
 
 
+@pytest.mark.interpreted
 @pytest.mark.parametrize("edge", [1.0, 2.0, 5.0])
 def test_histograms_count_what_plain_numpy_counts(edge: float) -> None:
     index, mean, _, normal = random_cells(6, 70, (6, 5, 3), edge)
@@ -151,6 +152,7 @@ def test_histograms_count_what_plain_numpy_counts(edge: float) -> None:
     assert np.array_equal(counts, plain_counts(mean, normal, lists(start, near)))
 
 
+@pytest.mark.interpreted
 def test_sums_of_distances_equal_plain_numpy() -> None:
     index, mean, covariance, normal = random_cells(7, 90, (7, 6, 3), 2.0)
     start, near = neighbours_within(index, mean, 2.0, 5.0)
@@ -195,6 +197,7 @@ def test_nothing_depends_on_where_the_map_lies_or_ends() -> None:
     assert np.array_equal(parts[0], parts[1], equal_nan=True)
 
 
+@pytest.mark.interpreted
 def test_identical_and_singular_neighbours_give_numbers() -> None:
     index = np.array([[0, 0, 0], [0, 0, 1], [0, 1, 0], [1, 0, 0], [40, 0, 0]])
     mean = np.array([[1.0, 1.0, 1.0]] * 4 + [[81.0, 1.0, 1.0]])
@@ -209,6 +212,7 @@ def test_identical_and_singular_neighbours_give_numbers() -> None:
     assert bhattacharyya_sums(mean, covariance, start, near) == pytest.approx(0.0, abs=1e-12)
 
 
+@pytest.mark.interpreted
 def test_fewer_than_three_neighbours_give_no_histogram() -> None:
     index = np.array([[0, 0, 0], [1, 0, 0], [2, 1, 0], [3, 0, 0]])
     mean = np.array([[1.0, 1.0, 1.0], [3.0, 1.5, 1.0], [5.0, 3.0, 1.2], [7.0, 1.0, 1.4]])
@@ -236,10 +240,3 @@ def test_a_street_has_the_same_terms_as_plain_numpy(shared_data) -> None:
     for c in range(0, len(index), 400):
         only = [around[c] if k == c else [] for k in range(len(index))]
         assert np.array_equal(counts[c], plain_counts(mean, normal, only)[c])
-
-
-@pytest.mark.slow
-@interpreted.outer
-def test_the_kernels_say_the_same_without_the_compiler() -> None:
-    chosen = "(plain_numpy or fewer_than_three or at_the_radius or identical) and not street"
-    assert interpreted.passed(__file__, chosen) == 7

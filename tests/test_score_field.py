@@ -1,6 +1,5 @@
 """The 441 scores of a cell's points against plain NumPy over all cells; the factors from them."""
 
-import interpreted
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -67,6 +66,7 @@ def test_scores_equal_plain_numpy_far_from_the_origin() -> None:
     assert_scores_equal(m, list(range(0, len(m.index), 5)))
 
 
+@pytest.mark.interpreted
 def test_scores_of_a_single_small_cell_equal_plain_numpy() -> None:
     rng = np.random.default_rng(3)
     m = Map(rng.integers(0, (2000, 2000, 40), (7, 3)), 2000)
@@ -140,6 +140,7 @@ def test_the_scores_of_a_symmetric_cell_are_symmetric() -> None:
     assert field.argmax() == SHIFTS // 2
 
 
+@pytest.mark.interpreted
 def test_a_value_is_a_power_of_two() -> None:
     for exponent in np.float32([0.0, 0.25, 0.999999, 1.0, 7.3, 23.9, 31.0]):
         value = score_field._value(exponent)
@@ -187,9 +188,3 @@ def test_a_whole_street_equals_plain_numpy(shared_data) -> None:
         m = Map(np.rint(street["mean"] * 1000).astype(np.int64), 4000)
     assert len(m.index) > 50
     assert_scores_equal(m, list(range(0, len(m.index), 40)))
-
-
-@interpreted.outer
-def test_the_kernel_says_the_same_without_the_compiler() -> None:
-    chosen = "single_small or power_of_two"
-    assert interpreted.passed(__file__, chosen) == 2

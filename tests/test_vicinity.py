@@ -1,6 +1,5 @@
 """What a sample point sees: membership, integer sums, depth images, against plain NumPy twins."""
 
-import interpreted
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -107,6 +106,7 @@ def test_sums_are_those_of_the_members(sensor: Sensor) -> None:
     check_sums(sensor, 700, drive())
 
 
+@pytest.mark.interpreted
 def test_sums_of_few_cells_are_those_of_the_members() -> None:
     check_sums(NARROW, 40, drive(3)[:3])
 
@@ -211,6 +211,7 @@ def test_the_guess_of_an_azimuth_is_as_near_as_it_claims(angle: float, length: f
     assert abs(error - np.rint(error)) < azimuth.UNSURE / 2000
 
 
+@pytest.mark.interpreted
 def test_azimuths_on_edges_fall_in_the_bin_that_begins_there() -> None:
     for bins in (90, 360):
         for b in range(bins):
@@ -226,6 +227,7 @@ def test_azimuths_on_edges_fall_in_the_bin_that_begins_there() -> None:
 # --- The depth image
 
 
+@pytest.mark.interpreted
 def test_points_are_thinned_to_whole_millimetres_half_to_even() -> None:
     points = np.random.default_rng(7).integers(-3000, 3000, (4000, 3))
     ours = thin(*cell_sums(points, 500), 500)
@@ -246,6 +248,7 @@ def test_the_depth_image_is_that_of_every_point(place: str, sensor: Sensor) -> N
     check_image(scene(place, seed=8, size=40.0, offset=UTM), sensor, eyes=14)
 
 
+@pytest.mark.interpreted
 def test_the_depth_image_of_few_points_is_that_of_every_point() -> None:
     check_image(scene("canyon", seed=8, size=12.0, spacing=0.8, offset=UTM), VLP16, eyes=3)
 
@@ -317,9 +320,3 @@ def test_the_weak_axis_of_a_tunnel_is_its_own(angle: float) -> None:
     assert minor[0] == pytest.approx(0.0, abs=1e-12)
     assert np.sin(weak[0] - angle) == pytest.approx(0.0, abs=1e-9)
     assert 0.0 <= weak[0] < np.pi
-
-
-@interpreted.outer
-def test_the_kernels_are_the_same_without_the_compiler() -> None:
-    chosen = "few_cells or few_points or on_edges or half_to_even"
-    assert interpreted.passed(__file__, chosen) == 4

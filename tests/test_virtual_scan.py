@@ -4,7 +4,6 @@ from dataclasses import replace
 from itertools import pairwise, product
 from pathlib import Path
 
-import interpreted
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -204,6 +203,7 @@ def literal_range(
     return best if best <= reach else np.inf
 
 
+@pytest.mark.interpreted
 @settings(max_examples=8, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_the_marching_is_that_of_the_literal_reference(seed: int) -> None:
@@ -332,6 +332,7 @@ def test_a_plane_gives_discs_on_it_and_single_points_balls() -> None:
     assert found.radius_mm.max() <= 200
 
 
+@pytest.mark.interpreted
 def test_the_points_that_decide_a_surfel_are_those_within_its_reach() -> None:
     rng = np.random.default_rng(7)
     points = rng.integers(-900, 900, (150, 3))
@@ -424,9 +425,3 @@ def test_a_place_in_a_wall_is_crowded_and_one_beside_it_is_not() -> None:
         place = np.array([x, 0, 0])
         scene = Scene.of(surfels_from(points), place[None], EDGE)
         assert low <= crowded(scene, place, beams, 0.9) <= high
-
-
-@interpreted.outer
-def test_the_kernels_say_the_same_without_the_compiler() -> None:
-    chosen = "literal_reference or decide_a_surfel"
-    assert interpreted.passed(__file__, chosen) == 2
