@@ -16,7 +16,7 @@ from tilestream.dataflow.tasks import perform
 from tilestream.errors import ModelError, SourceNotFoundError, TaskError
 from tilestream.factors import catalogue, observability
 from tilestream.factors.rows import PLACE_COLUMNS
-from tilestream.factors.virtual_drive import physics
+from tilestream.factors.virtual_drive import averaged_along, physics
 from tilestream.forest.dataset import Dataset, features_of, join
 from tilestream.forest.evaluation import criterion_importances, factor_sets, importances, judge
 from tilestream.forest.model_file import load_model, save_model
@@ -28,7 +28,7 @@ from tilestream.tables import is_done, read_mark, read_tables, write_table
 from tilestream.tiling import TileKey
 from tilestream.version import VERSION
 
-JOIN_VERSION = 1
+JOIN_VERSION = 2
 """Raise it when the dataset that is joined from the same tables changes."""
 TRAIN_VERSION = 1
 """Raise it when the model or the judgement that is made from the same dataset changes."""
@@ -169,8 +169,8 @@ class PredictTask:
     """Hash of what the model was made from: a process keeps the model of the tile before."""
     factors: str
     """The tile's factor table."""
-    observed: str
-    """Its table of observability; empty: the job has none."""
+    observed: tuple[str, ...]
+    """The tables of observability of this tile and of those around it; empty: the job has none."""
     tile: TileKey
     made_with: tuple[tuple[str, Any], ...]
     out: str
@@ -212,16 +212,18 @@ def _join(task: JoinTask) -> int:
 
 
 def places_with_factors(factors: Sequence[str], observed: Sequence[str]) -> pd.DataFrame:
-    """Every sample point of these tables with all its factors.
+    """Every sample point of the factor tables with all its factors.
 
-    A place that has the factors and could not be observed has NaN there, and says why.
+    A place that has the factors and could not be observed has NaN there, and says why. Virtual
+    drives are averaged along the route (`averaged_along`), so the tables of observability of the
+    tiles around have to be given too.
     """
     places = read_tables(factors)
     if not observed:
         return places
     keys = ["route_id", "sample"]
     names = [column.name for column in observability.COLUMNS]
-    seen = read_tables(observed)[[*keys, *names, "status", "reason"]]
+    seen = averaged_along(read_tables(observed))[[*keys, *names, "status", "reason"]]
     seen = seen.rename(columns={"status": "seen", "reason": "why"})
     joined = places.merge(seen, on=keys, how="left", validate="one_to_one")
     blind = (joined["status"] == "done") & (joined["seen"] != "done")
@@ -369,7 +371,7 @@ def _predict(task: PredictTask) -> int:
     """Rows written; 0 where they were there."""
     if is_done(task.out, task.identity):
         return 0
-    factors = places_with_factors([task.factors], [task.observed] if task.observed else [])
+    factors = places_with_factors([task.factors], task.observed)
     if task.model:
         model = _model(task.model, task.model_state)
         found = predict(model, factors, dict(task.made_with))

@@ -53,7 +53,7 @@ def forecast(settings: RunSettings) -> Forecast:
     store, reading, have, notes = _expected_map(settings, inputs)
     measure = plan_measure(settings, inputs, store, (), have)
     done = [Outcome(task.key, task.stage, None) for task in measure.tasks]
-    estimate = plan_estimate(settings, measure, done)
+    estimate = plan_estimate(settings, store.grid, measure, done)
     return Forecast((*reading, *measure.tasks, *estimate.tasks), tuple(notes))
 
 

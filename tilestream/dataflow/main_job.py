@@ -139,7 +139,7 @@ def run(
         measure = plan_measure(settings, inputs, read.store, read.merges.tasks, read.identities)
         _forget_others(settings, measure)
         measured = _measure(read, measure, client, watch, book)
-        estimate = plan_estimate(settings, measure, measured)
+        estimate = plan_estimate(settings, read.store.grid, measure, measured)
         estimated = _estimate(estimate, client, watch)
         book.note(estimate.tasks, estimated)
     learn(book.tasks, book.outcomes)

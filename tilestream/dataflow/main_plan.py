@@ -33,6 +33,7 @@ from tilestream.dataflow.tasks import Outcome
 from tilestream.errors import SourceNotFoundError, UsageError
 from tilestream.factors import catalogue
 from tilestream.factors.rows import samples_by_tile
+from tilestream.factors.virtual_drive import NEIGHBOURS
 from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.forest.dataset import features_of, made_with
 from tilestream.forest.evaluation import factor_sets
@@ -42,12 +43,14 @@ from tilestream.formats.routes import read_routes
 from tilestream.records import Route
 from tilestream.simulation.settings import SimulationSettings, load_preset
 from tilestream.store import TileStore, hash_of, open_store
-from tilestream.tiling import TileKey
+from tilestream.tiling import MM_PER_M, TileGrid, TileKey
 from tilestream.version import VERSION
 
 MAIN = "error_mean"
 PARTS = ("error_tail", "p_fail")
 """What is judged beside the mean error: what a map can know of it, and the share that is lost."""
+NEIGHBOURS_MM = round(NEIGHBOURS * MM_PER_M) + 1
+"""How far from a tile a sample point of it may have neighbours, rounding included [mm]."""
 
 
 @dataclass(frozen=True)
@@ -279,7 +282,9 @@ def reading_of(drive: DriveSettings) -> Reading:
     )
 
 
-def plan_estimate(settings: RunSettings, measure: Plan, outcomes: Sequence[Outcome]) -> Plan:
+def plan_estimate(
+    settings: RunSettings, grid: TileGrid, measure: Plan, outcomes: Sequence[Outcome]
+) -> Plan:
     """Join, judge, train, predict: from what was measured.
 
     What failed is left out here and listed by the run, so that a tile that cannot be read does not
@@ -335,14 +340,15 @@ def plan_estimate(settings: RunSettings, measure: Plan, outcomes: Sequence[Outco
         model, state = "", f"physics {settings.model.offset}"
     if state:
         for task in factors:
-            seen = observed.get(task.tile)
-            inputs = [task.identity, "" if seen is None else seen.identity]
+            near = grid.core(task.tile).grown(NEIGHBOURS_MM)
+            seen = [observed[key] for key in grid.keys_over(near) if key in observed]
+            inputs = [task.identity, *(one.identity for one in seen)]
             tasks.append(
                 PredictTask(
                     model,
                     state,
                     task.out,
-                    "" if seen is None else seen.out,
+                    tuple(one.out for one in seen),
                     task.tile,
                     tuple(making.items()),
                     f"{tables}/predictions/{task.tile}.parquet",

@@ -7,6 +7,7 @@ the sample point, spread and weighted so that they stand for the whole disc.
 import math
 
 import numpy as np
+import pandas as pd
 
 from tilestream.config import RegistrationSettings
 from tilestream.localization import FAILED, NEAR, disc_starts, register, start_errors
@@ -15,6 +16,9 @@ from tilestream.records import Cells, Column, Float64
 STRATA = ((0.0, 0.5, 1.0 / 8.0), (0.5, 0.75, 1.0 / 4.0), (0.75, 1.0, 5.0 / 8.0))
 """Rings of the disc of starts: beyond which share of its radius, up to which, and with which share
 of the starts. The far ones decide the tail."""
+NEIGHBOURS = 2.0
+"""Virtual drives from within this distance along the route count as of one place [m]: the radius of
+the disc of starts."""
 GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 """Turn from one start to the next, so that any number of them is spread evenly [rad]."""
 
@@ -33,6 +37,11 @@ COLUMNS = (
     _column("vd_across", "m", "Mean of abs(across), the error across the route."),
     _column("vd_up", "m", "Mean of abs(up), the error in map z."),
 )
+
+AVERAGED = tuple(column.name for column in COLUMNS if column.name != "vd_median")
+"""What is averaged along the route; the median may have no number."""
+SLACK = 1e-6
+"""Arc lengths are sums: neighbours at the full distance may lie this much beyond it [m]."""
 
 
 def stratified_starts(count: int | None = 64) -> tuple[Float64, Float64]:
@@ -133,3 +142,32 @@ def physics_offset(vd_mean: Float64, error_mean: Float64) -> float:
     """The offset of `physics` that fits measured errors best: the median of the differences [m]."""
     difference = np.asarray(error_mean, np.float64) - np.asarray(vd_mean, np.float64)
     return float(np.median(difference[np.isfinite(difference)]))
+
+
+def averaged_along(places: pd.DataFrame) -> pd.DataFrame:
+    """The virtual drives of sample points, averaged with those of their neighbours on the route.
+
+    Where a registration ends is a draw, and places 1 m apart see nearly the same: their drives are
+    more draws of one. With sample points farther apart than `NEIGHBOURS` each stands for itself.
+
+    Args:
+        places: a row per sample point: `route_id`, `arc_length` [m], `status`, `COLUMNS`; an index
+            without repeats. The average of a point is true if all within `NEIGHBOURS` of it are
+            there.
+
+    Returns:
+        The table, rows in the same order, `AVERAGED` of the points that are done as means over the
+        points that are done from `arc_length - NEIGHBOURS` to `arc_length + NEIGHBOURS`: the same
+        to the bit in any company.
+    """
+    averaged = places.copy()
+    done = places[places["status"] == "done"].sort_values("arc_length", kind="stable")
+    for _, route in done.groupby("route_id", sort=False):
+        arc = route["arc_length"].to_numpy(np.float64)
+        first = np.searchsorted(arc, arc - NEIGHBOURS - SLACK)
+        behind = np.searchsorted(arc, arc + NEIGHBOURS + SLACK)
+        # Each window is summed for itself, in its order; the row of zeros ends the last one.
+        values = np.vstack([route[list(AVERAGED)].to_numpy(np.float64), np.zeros(len(AVERAGED))])
+        sums = np.add.reduceat(values, np.column_stack([first, behind]).ravel(), axis=0)[::2]
+        averaged.loc[route.index, list(AVERAGED)] = sums / (behind - first)[:, None]
+    return averaged
