@@ -8,7 +8,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -374,8 +374,15 @@ def test_certificates_are_passed_through(tmp_path: Path) -> None:
         with dask_client(address, None, 1, tls=tls) as client:
             assert execute([Nap(TileKey(0, 0))], client, None)[0].result == "0_0"
         with (
-            pytest.raises(UsageError, match=r"perhaps check your TLS configuration"),
+            pytest.raises(UsageError, match=r"wants certificates: give --tls-ca"),
             dask_client(address, None, 1),
+        ):
+            pass
+        (tmp_path / "other").mkdir()
+        strange = certificates(tmp_path / "other")
+        with (
+            pytest.raises(TaskError, match=r"no Dask .* answers at .* or not to these certificate"),
+            dask_client(address, None, 1, tls=strange),
         ):
             pass
         with (
@@ -383,6 +390,14 @@ def test_certificates_are_passed_through(tmp_path: Path) -> None:
             dask_client(address.replace("tls", "tcp"), None, 1, tls=tls),
         ):
             pass
+
+
+def test_certificates_that_do_not_fit_together_are_named(tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    ours, theirs = certificates(tmp_path), certificates(tmp_path / "other")
+    for wrong in (replace(ours, key=theirs.key), replace(ours, ca=__file__)):
+        with pytest.raises(UsageError, match=r"key\.pem are no certificates that fit together"):
+            wrong.security()
 
 
 def test_nobody_answers() -> None:

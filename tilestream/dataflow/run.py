@@ -4,6 +4,7 @@ import logging
 import os
 import queue
 import signal
+import ssl
 import time
 import uuid
 from collections import Counter, deque
@@ -13,6 +14,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
+import dask.config
 import distributed
 from dask.base import annotate, get_annotations
 from dask.system import CPU_COUNT
@@ -392,7 +394,16 @@ class TlsFiles:
     """Path of its private key."""
 
     def security(self) -> Any:
-        """As Dask takes them; nothing unencrypted is let in."""
+        """As Dask takes them; nothing unencrypted is let in.
+
+        Raises:
+            UsageError: they cannot be read, or the key is not the certificate's.
+        """
+        try:
+            ssl.create_default_context(cafile=self.ca).load_cert_chain(self.cert, self.key)
+        except OSError as error:
+            files = f"{self.ca}, {self.cert} and {self.key}"
+            raise UsageError(f"{files} are no certificates that fit together: {error}") from error
         roles = ("client", "scheduler", "worker")
         named = {f"tls_{role}_cert": self.cert for role in roles}
         named |= {f"tls_{role}_key": self.key for role in roles}
@@ -433,7 +444,7 @@ def dask_client(
 
     Raises:
         TaskError: nobody answers at the scheduler's address.
-        UsageError: the scheduler's address is none.
+        UsageError: the scheduler's address is none, or certificates are missing or do not fit.
     """
     security = None if tls is None else tls.security()
     count = CPU_COUNT if workers is None else workers
@@ -491,12 +502,16 @@ class _Client(distributed.Client):
 @contextmanager
 def _connected(scheduler: str, security: Any | None) -> Iterator[Any]:
     """A client of a scheduler that runs elsewhere."""
+    encrypted = scheduler.startswith("tls:")
+    if encrypted and security is None and not dask.config.get("distributed.comm.tls.ca-file"):
+        raise UsageError(f"{scheduler} wants certificates: give --tls-ca, --tls-cert and --tls-key")
     try:
         client = _Client(scheduler, security=security)  # type: ignore[no-untyped-call]
     except (OSError, TimeoutError, CommClosedError) as error:
-        raise TaskError(f"no Dask scheduler answers at {scheduler}: {error}") from error
-    except (ValueError, TypeError, RuntimeError) as error:  # of an address without its
-        # certificates, or of certificates for an address that takes none
+        hint = ", or not to these certificates" if encrypted else ""
+        raise TaskError(f"no Dask scheduler answers at {scheduler}{hint}: {error}") from error
+    except (ValueError, TypeError, RuntimeError) as error:  # of certificates for an address that
+        # takes none, or of an address that is none
         raise UsageError(f"{scheduler!r} is no scheduler that can be asked: {error}") from error
     with client:
         yield client
