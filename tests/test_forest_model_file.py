@@ -15,6 +15,7 @@ import skops.io
 from forest_data import COLUMNS, dataset, drives
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import spearmanr
 from sklearn.linear_model import LinearRegression
 
 from tilestream.dataflow.estimate_tasks import COLUMNS as COLUMNS_LEARNT
@@ -24,8 +25,20 @@ from tilestream.forest.dataset import TARGETS, Dataset, features_of, join, made_
 from tilestream.forest.domain import domain_of
 from tilestream.forest.model_file import load_model, save_model
 from tilestream.forest.models import Recipe, grow
-from tilestream.forest.reasons import PHRASES, contributions, in_words, phrase_of
+from tilestream.forest.reasons import (
+    PHRASES,
+    REASSURING,
+    SHARES,
+    UNITS,
+    Typical,
+    compared,
+    contributions,
+    in_words,
+    phrase_of,
+    typical_of,
+)
 from tilestream.forest.training import PREDICTION_COLUMNS, Model, predict, train
+from tilestream.records import Column
 from tilestream.sensors import HDL64, VLP16
 
 MADE_WITH = made_with(COLUMNS, VLP16, 2.0)
@@ -163,25 +176,153 @@ def test_contributions_add_up_to_the_estimate(learnt: Dataset) -> None:
     assert (added[:, unused] == 0.0).all()
 
 
+def usual(names: list[str], middle: list[float], rho: list[float], unit: str = "1") -> Typical:
+    """What is typical, with quartiles 10 % of the median away."""
+    spread = 0.1 * np.array(middle)
+    units = tuple("m" if name in ("vd_mean", "vd_along") else unit for name in names)
+    return Typical(tuple(names), units, np.array(middle), spread, spread, np.array(rho))
+
+
 def test_reasons_are_words_for_what_raises_the_estimate() -> None:
     names = ["feature_count", "D1_count", "normal_H_8", "new_factor"]
-    X, typical = np.array([[100.0, 5.0, 1.0, 9.0]]), np.array([900.0, 50.0, 3.0, 2.0])
-    (words,) = in_words(np.array([[0.05, -0.01, 0.03, 0.001]]), X, typical, names)
+    typical = usual(names, [900.0, 50.0, 3.0, 2.0], [-0.4, -0.3, -0.2, 0.1])
+    X = np.array([[100.0, 5.0, 1.0, 9.0]])
+    (words,) = in_words(np.array([[0.05, -0.01, 0.03, 0.001]]), names, X, typical)
     assert words == (
         "few features in view (feature_count 100, typically 900); "
-        "parallel walls, surfaces face few directions (normal_H_8 1, typically 3)"
+        "parallel walls, surfaces face few directions (normal_H_8 1, typically 3); "
+        "few poles and edges in view (D1_count 5, typically 50)"
     )
-    (same,) = in_words(
-        np.array([[0.03, 0.02, 0.04, 0.0]]), X, typical, ["D3_count", "D3_ratio", *names[2:]]
+    same = ["D3_count", "D3_ratio", *names[2:]]
+    (together,) = in_words(
+        np.array([[0.03, 0.02, 0.04, 0.0]]), same, X, replace(typical, names=tuple(same))
     )
-    assert same.startswith("bare surfaces without detail (D3_count")
-    assert in_words(np.array([[0.0, -1.0, 0.0, 0.0]]), X, typical, names) == [""]
+    assert together.startswith("bare surfaces without detail (D3_count 100, typically 900); ")
+    assert in_words(np.full((1, 4), -1.0), names, typical.middle[None], typical) == [""]
     assert phrase_of("new_factor", True) == "high new_factor"
 
 
-def test_every_factor_has_a_phrase() -> None:
-    assert {column.name for column in features_of(COLUMNS_LEARNT)} == set(PHRASES)
+def test_a_symptom_is_followed_by_causes_in_the_map() -> None:
+    names = [
+        "vd_mean",
+        "vd_along",
+        "ob_info_along",
+        "ob_returns",
+        "wall_H",
+        "sight_HDOP",
+        "D2_count",
+    ]
+    middle = [0.05, 0.04, 9000.0, 0.8, 4.6, 2.2, 50.0]
+    typical = usual(names, middle, [0.8, 0.7, -0.4, 0.3, -0.2, 0.0, -0.3])
+    X = np.array([[0.892, 0.5, 600.0, 0.81, 4.0, 3.0, 60.0]])
+    added = np.array([[0.5, 0.2, 0.01, 0.02]])
+    (words,) = in_words(added, names[:4], X, typical)
+    # ob_returns is as usual, sight_HDOP has no bad side, D2_count lies on its good one.
+    assert words == (
+        "a virtual drive does not hold its place (89\u00a0cm, typically 5\u00a0cm); "
+        "nothing fixes the direction of travel (ob_info_along 600, typically 9000); "
+        "parallel walls, surfaces face few directions (wall_H 4, typically 4.6)"
+    )
+    X[0, 4:] = np.nan
+    (words,) = in_words(added, names[:4], X, typical)
+    assert words.count("; ") == 1
+    assert words.endswith(
+        "; nothing fixes the direction of travel (ob_info_along 600, typically 9000)"
+    )
+    reassuring = usual(["vd_mean", "ob_unmapped"], [0.05, 0.1], [0.8, -0.4])
+    (words,) = in_words(
+        np.array([[0.5, 0.1]]), reassuring.names, np.array([[0.8, 0.0]]), reassuring
+    )
+    assert words == "a virtual drive does not hold its place (80\u00a0cm, typically 5\u00a0cm)"
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "value", "middle", "told"),
+    [
+        ("vd_mean", "m", 0.892, 0.0536, "89\u00a0cm, typically 5.4\u00a0cm"),
+        ("vd_mean", "m", 1.234, 0.0, "120\u00a0cm, typically 0\u00a0cm"),
+        ("r_average", "m", 43.21, 63.35, "43\u00a0m, typically 63\u00a0m"),
+        ("euclidean_dist", "m", 0.7512, 0.7466, "75.1\u00a0cm, typically 74.7\u00a0cm"),
+        ("vd_p_fail", "1", 0.123, 0.0221, "12\u00a0%, typically 2.2\u00a0%"),
+        ("normal_H_8", "bit", 0.41, 0.83, "normal_H_8 0.41 bit, typically 0.83 bit"),
+        ("feature_count", "1", 1234.0, 9871.0, "feature_count 1200, typically 9900"),
+        ("ob_info_up", "1/m^2", 574.7, 14756.0, "ob_info_up 570 per m², typically 15000 per m²"),
+        ("ob_weak_angle", "rad", 0.1, 0.2, "ob_weak_angle 5.7°, typically 11°"),
+        ("FDOP", "lux", 0.5, 0.5, "FDOP 0.5 lux, typically 0.5 lux"),
+    ],
+)
+def test_figures_are_told_as_a_person_reads_them(
+    name: str, unit: str, value: float, middle: float, told: str
+) -> None:
+    assert compared(0, value, usual([name], [middle], [0.5], unit)) == told
+
+
+def test_what_is_typical_has_quartiles_and_a_bad_side() -> None:
+    rng = np.random.default_rng(0)
+    error = rng.lognormal(size=400)
+    rare = (np.arange(400) % 10 == 0).astype(float)
+    X = np.column_stack(
+        [np.exp(-error), error + 8.0 * rng.normal(size=400), np.full(400, 16.0), rare]
+    )
+    columns = [Column(name, "FS", "1", "", "") for name in "abcd"]  # type: ignore[arg-type]
+    found = typical_of(X, error, columns, 400)
+    weak = spearmanr(X[:, 1], error).statistic
+    assert 0.15 < weak < 0.4
+    assert found.rho == pytest.approx([-1.0, weak, 0.0, 0.0])
+    assert typical_of(X, error, columns, 25).rho == pytest.approx([-1.0, 0.0, 0.0, 0.0])
+    low, middle, high = np.percentile(X[:, 0], [25, 50, 75])
+    assert found.middle[0] == pytest.approx(middle)
+    values = np.array([[low, 0.0, 99.0, 0.0], [high, np.inf, 16.0, 1.0], [np.nan] * 4])
+    out = found.out(values)
+    assert out[:, 0] == pytest.approx([-1.0, 1.0, 0.0])
+    assert (out[1:, 1] == 0.0).all()
+    assert (out[:, 2] == 0.0).all()
+    assert out[:, 3] == pytest.approx([0.0, 1.0 / rare.std(), 0.0])
+
+
+def test_the_worst_places_name_a_cause_in_the_map() -> None:
+    """The trees ask the virtual drive alone; the map's own factors say why it drifts."""
+    factors, labels = drives(3, {"a": 500, "b": 500})
+    rng = np.random.default_rng(3)
+    seen = (
+        Column("vd_mean", "OB", "m", "", "", "observability"),
+        Column("ob_info_along", "OB", "1/m^2", "", "", "observability"),
+    )
+    error = labels["error_mean"].to_numpy()
+    factors["vd_mean"] = error * np.exp(0.05 * rng.normal(size=len(error)))
+    factors["ob_info_along"] = 500.0 / error * np.exp(rng.normal(size=len(error)))
+    factors["angular_H"] = 5.0 - np.log(error) + 0.4 * rng.normal(size=len(error))
+    learnt = join(factors, {"drive": labels}, (*COLUMNS, *seen))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training, "tuned", lambda *_: Recipe(trees=10, leaf=8, log=True))
+        model = train(learnt)
+    typical = model.typical
+    assert model.factors == ("vd_mean", "ob_info_along")
+    found = predict(model, factors)
+    worst = factors[found["estimate"] > model.worst]
+    reasons = found.loc[worst.index, "reason"].str.split("; unlike").str[0]
+    assert reasons.str.startswith("a virtual drive does not hold its place (").all()
+    bad = typical.rho * typical.out(worst[list(typical.names)].to_numpy())
+    own = [name in NAMES for name in typical.names]
+    far = (bad[:, own] >= 1.2 * np.abs(typical.rho[own])) & (typical.rho[own] != 0.0)
+    phrases = [phrase_of(n, bool(r > 0.0)) for n, r in zip(NAMES, typical.rho[own], strict=True)]
+    causes = far & ~np.isin(phrases, list(REASSURING))
+    assert causes.any(axis=1).sum() > 150
+    assert reasons[causes.any(axis=1)].str.contains("; ").all()
+    assert reasons.str.contains("features on few sides only (angular_H", regex=False).sum() > 150
+    lean = predict(model, factors[["vd_mean", "ob_info_along"]])
+    pd.testing.assert_frame_equal(lean.drop(columns="reason"), found.drop(columns="reason"))
+    assert lean["reason"].str.contains("nothing fixes the direction of travel").sum() > 50
+    assert not lean["reason"].str.contains("angular_H").any()
+
+
+def test_every_factor_has_a_phrase_and_its_unit_words() -> None:
+    columns = features_of(COLUMNS_LEARNT)
+    assert {column.name for column in columns} == set(PHRASES)
     assert set(NAMES) <= set(PHRASES)
+    assert {column.unit for column in columns} <= {"m", *UNITS}
+    shares = {c.name for c in columns if c.meaning.startswith(("Share", "Mean share"))}
+    assert shares == SHARES
 
 
 def test_a_model_is_one_file(model: Model, places: pd.DataFrame, tmp_path: Path) -> None:
@@ -212,11 +353,12 @@ def altered(path: Path, facts: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("facts", "message"),
     [
-        ({"format_version": 0}, "of format 0, and this tilestream .* reads 1"),
+        ({"format_version": 0}, "of format 0, and this tilestream .* reads 2"),
         ({"sklearn": "0.24.2"}, f"scikit-learn 0.24.2, here is {sklearn.__version__}"),
         ({"format": "other"}, "no model of tilestream"),
         ({"factors": ["one"]}, "its forest is not of its factors"),
         ({"interval": None}, "a damaged model file"),
+        ({"typical": {"names": ["FDOP"], "units": ["1"]}}, "what is typical is not of its factors"),
     ],
 )
 def test_an_old_or_foreign_model_is_refused(

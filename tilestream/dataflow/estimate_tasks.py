@@ -30,7 +30,7 @@ from tilestream.version import VERSION
 
 JOIN_VERSION = 2
 """Raise it when the dataset that is joined from the same tables changes."""
-TRAIN_VERSION = 1
+TRAIN_VERSION = 2
 """Raise it when the model or the judgement that is made from the same dataset changes."""
 FOREST_BYTES = 600_000_000
 """Memory of a task that grows forests, beyond the interpreter, for some thousand places."""

@@ -23,11 +23,12 @@ from tilestream.errors import ModelError, SourceNotFoundError
 from tilestream.forest.domain import Domain
 from tilestream.forest.intervals import Interval
 from tilestream.forest.models import Forest
+from tilestream.forest.reasons import Typical
 from tilestream.forest.training import Model
 from tilestream.version import VERSION
 
 FORMAT = "tilestream model"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 """Raise it when a model of an older file would be read wrongly."""
 TRUSTED = ("sklearn.tree._tree.Tree",)
 """What skops is told to build beyond what it trusts by itself."""
@@ -44,6 +45,8 @@ TYPES = frozenset(
     }
 )
 """Every type that a model file may name."""
+TYPICAL = ("middle", "below", "above", "rho")
+"""The arrays of `Typical`, one number per factor."""
 
 
 def save_model(model: Model, path: str | os.PathLike[str]) -> None:
@@ -67,6 +70,7 @@ def save_model(model: Model, path: str | os.PathLike[str]) -> None:
         "data_set": dict(model.data_set),
         "interval": {k: None if v != v else v for k, v in asdict(model.interval).items()},
         "threshold": model.domain.threshold,
+        "typical": {"names": model.typical.names, "units": model.typical.units},
         "worst": model.worst,
         "log": {target: forest.log for target, forest in model.forests.items()},
         "facts": dict(model.facts),
@@ -79,6 +83,7 @@ def save_model(model: Model, path: str | os.PathLike[str]) -> None:
             "scale": model.domain.scale,
             "whitening": model.domain.whitening,
         },
+        "typical": {name: getattr(model.typical, name) for name in TYPICAL},
     }
     part = place.with_name(f"{place.name}.{os.getpid()}.part")
     part.write_bytes(skops.io.dumps(content, compression=zipfile.ZIP_DEFLATED, compresslevel=6))
@@ -164,10 +169,15 @@ def _model(content: Mapping[str, Any], facts: Mapping[str, Any]) -> Model:
     shapes = {"middle": (len(names),), "scale": (len(names),), "whitening": (len(names),) * 2}
     if {name: array.shape for name, array in arrays.items()} != shapes:
         raise ModelError("a damaged model file: its domain has not its factors")
+    typical = {name: np.asarray(content["typical"][name], np.float64) for name in TYPICAL}
+    known, units = (tuple(str(text) for text in facts["typical"][k]) for k in ("names", "units"))
+    if {len(units), *(a.size for a in typical.values())} != {len(known)} or set(names) - set(known):
+        raise ModelError("a damaged model file: what is typical is not of its factors")
     level, factor, blocks = (facts["interval"][k] for k in ("level", "factor", "blocks"))
     return Model(
         forests=forests,
         domain=Domain(**arrays, threshold=float(facts["threshold"])),
+        typical=Typical(known, units, **typical),
         interval=Interval(
             float("nan") if level is None else float(level),
             float("nan") if factor is None else float(factor),

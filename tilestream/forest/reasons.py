@@ -1,17 +1,30 @@
-"""Why an estimate is high, in words: from the factors that drive the trees there."""
+"""Why an estimate is high, in words: what drives the trees there, and what the map is like."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
+from scipy.stats import rankdata
 from sklearn.ensemble import RandomForestRegressor
 
-from tilestream.records import Float64
+from tilestream.records import Column, Float64
 
-WORDS_MAX = 2
-"""Most causes named for a place."""
-SHARE_MIN = 0.2
-"""A cause is named when it has at least this share of all that raises the estimate."""
+CLEAR = 0.15
+"""Least rank correlation with the error [abs] at which a factor of the map has a bad side."""
+ERRORS = 2.0
+"""And that many standard errors: on a short drive anything goes with the error by chance."""
+PIECE = 20.0
+"""Points within this along a path say the same [m] (the correlation length of definitions,
+section 6)."""
+OUT = 1.0
+"""A factor is named as a cause from this far out: beyond the training quartile."""
+OUT_MOST = 5.0
+"""Farther out counts as this."""
+NOTICEABLE = 0.03
+"""And when its value differs from the median by this share of it: factors that hardly vary have
+quartiles that nobody would see."""
 
 FEW = "few features in view"
 CROWDED = "a crowded view: features everywhere"
@@ -37,7 +50,8 @@ REPEATED = "repeated structure, neighbours look alike"
 IRREGULAR = "irregular structure, neighbours look unlike"
 ALONG = "nothing fixes the direction of travel"
 ACROSS = "nothing fixes the direction across"
-DILUTED = "directions that leave a position weak"
+IN_LINE = "what is in view lies along one line"
+LEVEL = "what is in view lies at one height"
 SPANNED = "directions spread all round"
 LOOSE = "much of the map in cells with too few points"
 DENSE = "dense cells throughout"
@@ -45,6 +59,7 @@ SLIDES_ALONG = "a virtual drive slides along the road"
 SLIDES_ACROSS = "a virtual drive slides across the road"
 SINKS = "a virtual drive rises or sinks"
 DRIFTS = "a virtual drive does not hold its place"
+STRAYS = "a virtual drive goes astray from distant starts"
 LOST = "a virtual drive gets lost from many starts"
 HOLDS = "a virtual drive holds its place"
 WEAK = "nothing fixes the position in one direction"
@@ -54,7 +69,6 @@ HEIGHT = "nothing fixes the height"
 UNLIKE = "the map blurs what a scan would see there"
 ALIKE = "the map is just what a scan would see there"
 UNSEEN = "few beams would come back"
-SEEN = "beams come back from everywhere"
 UNMAPPED = "much of the view is not in the map"
 MAPPED = "all of the view is in the map"
 TRAFFIC = "traffic baked into the map stands in view"
@@ -81,10 +95,10 @@ PHRASES: dict[str, tuple[str, str]] = {
     "normal_H_16": (PARALLEL, SCATTERED),
     "normal_H_90": (PARALLEL, SCATTERED),
     "angular_H": (ONE_SIDE, ALL_SIDES),
-    "sight_HDOP": (SPANNED, DILUTED),
-    "sight_VDOP": (SPANNED, DILUTED),
+    "sight_HDOP": (SPANNED, IN_LINE),
+    "sight_VDOP": (SPANNED, LEVEL),
     "normal_HDOP": (SCATTERED, PARALLEL),
-    "normal_VDOP": (SPANNED, DILUTED),
+    "normal_VDOP": (SPANNED, HEIGHT),
     "wall_H": (PARALLEL, SCATTERED),
     "wall_major": (NO_WALLS, PLANES),
     "wall_minor": (PARALLEL, PLANES),
@@ -111,20 +125,95 @@ PHRASES: dict[str, tuple[str, str]] = {
     "ob_weak_angle": (ALONG, ACROSS),
     "ob_score": (UNLIKE, ALIKE),
     "ob_nvtl": (UNLIKE, ALIKE),
-    "ob_points": (UNSEEN, SEEN),
+    "ob_points": (FEW, CROWDED),
     "ob_cells": (FEW, CROWDED),
-    "ob_returns": (UNSEEN, SEEN),
+    "ob_returns": (UNSEEN, CLOSED),
     "ob_unmapped": (MAPPED, UNMAPPED),
     "ob_ghosts": (EMPTY, TRAFFIC),
     "vd_mean": (HOLDS, DRIFTS),
     "vd_floor": (HOLDS, DRIFTS),
-    "vd_tail": (HOLDS, LOST),
+    "vd_tail": (HOLDS, STRAYS),
     "vd_p_fail": (HOLDS, LOST),
     "vd_along": (HOLDS, SLIDES_ALONG),
     "vd_across": (HOLDS, SLIDES_ACROSS),
     "vd_up": (HOLDS, SINKS),
 }
 """What a value below, or above, that of a typical training place says about a place."""
+
+
+REASSURING = frozenset({ALL_SIDES, SPANNED, DENSE, STEEP, HOLDS, FIRM, ALIKE, MAPPED, EMPTY})
+"""What is no cause of an error, on whichever side the factor is bad."""
+SHARES = frozenset(
+    {
+        *(f"D{d}_{kind}" for d in (1, 2, 3) for kind in ("ratio", "share")),
+        *("occupancy_ratio", "loose_share", "ob_returns", "ob_unmapped", "ob_ghosts", "vd_p_fail"),
+    }
+)
+"""Factors that are told in percent."""
+UNITS = {
+    "1": (1.0, ""),
+    "bit": (1.0, " bit"),
+    "m^2": (1.0, "\u00a0m²"),
+    "rad": (180.0 / np.pi, "°"),
+    "1/m": (1.0, " per m"),
+    "1/m^2": (1.0, " per m²"),
+    "1/rad^2": (1.0, " per rad²"),
+}
+"""How a unit is told: times what, and followed by what."""
+
+
+@dataclass(frozen=True, eq=False)
+class Typical:
+    """What factors are at the training places, and on which side of that errors are larger."""
+
+    names: tuple[str, ...]
+    """All factors of the dataset, also those that the trees do not ask for."""
+    units: tuple[str, ...]
+    """Their units (`Column.unit`)."""
+    middle: Float64
+    """(f,) median of each."""
+    below: Float64
+    """(f,) from the lower quartile to the median; the standard deviation where they are equal."""
+    above: Float64
+    """(f,) from the median to the upper quartile, likewise."""
+    rho: Float64
+    """(f,) rank correlation with the error; 0 where it is not clear."""
+
+    def out(self, values: Float64) -> Float64:
+        """(n, f) how far values lie above (> 0) or below the median, 1 being the quartile on that
+        side; 0 for no value.
+        """
+        away = values - self.middle
+        with np.errstate(invalid="ignore", divide="ignore"):
+            out = away / np.where(away > 0.0, self.above, self.below)
+        return np.where(np.isfinite(out), out, 0.0)
+
+
+def typical_of(X: Float64, error: Float64, columns: Sequence[Column], pieces: int) -> Typical:
+    """What is typical of training places.
+
+    Args:
+        X: (n, f) their factors.
+        error: (n,) their errors.
+        columns: the factors.
+        pieces: how many of the places speak for themselves: pieces of `PIECE` along the paths.
+    """
+    low, middle, high = np.percentile(X, [25, 50, 75], axis=0)
+    deviation = X.std(axis=0)
+    ranks, of_error = rankdata(X, axis=0), rankdata(error)
+    varies = (np.ptp(ranks, axis=0) > 0.0) & (np.ptp(of_error) > 0.0)
+    rho = np.zeros(len(columns))
+    for k in np.flatnonzero(varies):
+        rho[k] = np.corrcoef(ranks[:, k], of_error)[0, 1]
+    clear = np.abs(rho) >= max(CLEAR, ERRORS / np.sqrt(pieces))
+    return Typical(
+        tuple(column.name for column in columns),
+        tuple(column.unit for column in columns),
+        middle,
+        np.where(middle > low, middle - low, deviation),
+        np.where(high > middle, high - middle, deviation),
+        np.where(clear, rho, 0.0),
+    )
 
 
 def contributions(forest: RandomForestRegressor, X: Float64) -> Float64:
@@ -151,38 +240,99 @@ def contributions(forest: RandomForestRegressor, X: Float64) -> Float64:
 
 
 def in_words(
-    contribution: Float64, X: Float64, typical: Float64, names: Sequence[str]
+    contribution: Float64, names: Sequence[str], values: Float64, typical: Typical
 ) -> list[str]:
-    """The causes of each estimate, the largest first; "" where nothing raises it.
+    """Why each estimate is high: a symptom, then causes; "" where nothing raises it.
 
-    Factors that say the same (the counts are all correlated) are added up before they are ranked.
-    Each cause names the factor behind it that weighs most, its value, and a typical one.
+    1. What raises the estimate most. Where there is a virtual drive it is what that does there.
+    2. What else that the trees ask for raises it most, but for the virtual drive: what a scan would
+       see there.
+    3. What of the map's own factors lies farthest out on its bad side, where errors were clearly
+       larger in training, times how clearly. The trees need not ask for it.
+
+    A cause, 2 or 3, lies beyond the training quartile, noticeably away from the median, and sounds
+    like one. Factors that say the same (the counts are all correlated) are added up before they are
+    ranked; nothing is said twice. Each phrase comes with the factor that weighs most in it, its
+    value there and the median of the training places.
 
     Args:
-        contribution: (n, f) what each factor adds (`contributions`).
-        X: (n, f) the factors.
-        typical: (f,) median of each among the training places.
-        names: their names; one without a phrase speaks for itself.
+        contribution: (n, k) what each factor of the trees adds (`contributions`).
+        names: (k,) those factors, each of them in `typical`.
+        values: (n, f) the factors of `typical`; NaN where the table has none.
+        typical: of the training places.
     """
-    return [_causes(contribution[row], X[row], typical, names) for row in range(len(X))]
-
-
-def _causes(added: Float64, x: Float64, typical: Float64, names: Sequence[str]) -> str:
-    raised = np.maximum(added, 0.0)
-    by_phrase: dict[str, float] = {}
-    foremost: dict[str, int] = {}
-    for k in np.argsort(-raised, kind="stable"):
-        if raised[k] > 0.0:
-            phrase = phrase_of(names[k], bool(x[k] > typical[k]))
-            by_phrase[phrase] = by_phrase.get(phrase, 0.0) + float(raised[k])
-            foremost.setdefault(phrase, int(k))
-    total = sum(by_phrase.values())
-    ranked = sorted(by_phrase, key=lambda phrase: (-by_phrase[phrase], phrase))
-    named = ranked[:1] + [p for p in ranked[1:WORDS_MAX] if by_phrase[p] >= SHARE_MIN * total]
-    return "; ".join(
-        f"{phrase} ({names[k]} {x[k]:.3g}, typically {typical[k]:.3g})"
-        for phrase, k in ((phrase, foremost[phrase]) for phrase in named)
+    raised = np.zeros(values.shape)
+    raised[:, [typical.names.index(name) for name in names]] = np.maximum(contribution, 0.0)
+    high, out = values > typical.middle, typical.out(values)
+    phrases = np.array(
+        [[phrase_of(name, side) for name in typical.names] for side in (False, True)]
     )
+    seen = np.abs(values - typical.middle) >= NOTICEABLE * np.abs(typical.middle)
+    reassuring = np.isin(np.where(high, phrases[1], phrases[0]), list(REASSURING))
+    cause = (np.abs(out) >= OUT) & seen & ~reassuring
+    virtual, scan = (
+        np.array([name.startswith(prefix) for name in typical.names]) for prefix in ("vd_", "ob_")
+    )
+    bad = np.clip(typical.rho * np.clip(out, -OUT_MOST, OUT_MOST), 0.0, None)
+    steps = (
+        raised,
+        np.where(cause & ~virtual, raised, 0.0),
+        np.where(cause & ~virtual & ~scan, bad, 0.0),
+    )
+    return [
+        _reason(
+            [step[row] for step in steps],
+            phrases[high[row].astype(int), np.arange(len(virtual))],
+            values[row],
+            typical,
+        )
+        for row in range(len(values))
+    ]
+
+
+def _reason(
+    steps: Sequence[Float64], phrases: NDArray[np.str_], x: Float64, typical: Typical
+) -> str:
+    """The heaviest phrase of each step that no step before has said."""
+    said: dict[str, str] = {}
+    for weight in steps:
+        total: dict[str, float] = {}
+        foremost: dict[str, int] = {}
+        for k in np.argsort(-weight, kind="stable")[: np.count_nonzero(weight)]:
+            phrase = str(phrases[k])
+            total[phrase] = total.get(phrase, 0.0) + float(weight[k])
+            foremost.setdefault(phrase, int(k))
+        left = sorted(set(total) - set(said), key=lambda phrase: (-total[phrase], phrase))
+        if left:
+            said[left[0]] = compared(foremost[left[0]], float(x[foremost[left[0]]]), typical)
+    return "; ".join(f"{phrase} ({figures})" for phrase, figures in said.items())
+
+
+def compared(k: int, value: float, typical: Typical, *, named: bool = False) -> str:
+    """A factor's value beside the typical one, in units that a person reads: `89 cm, typically
+    5 cm`. After a phrase lengths and shares speak for themselves; others are `named` in any case.
+    """
+    name, middle = typical.names[k], float(typical.middle[k])
+    times, unit = UNITS.get(typical.units[k], (1.0, f" {typical.units[k]}"))
+    named = named or not (name in SHARES or typical.units[k] == "m")
+    if name in SHARES:
+        times, unit = 100.0, "\u00a0%"
+    elif typical.units[k] == "m":
+        times, unit = (100.0, "\u00a0cm") if abs(middle) < 1.0 else (1.0, "\u00a0m")
+    here, usual = _apart(value * times, middle * times)
+    return f"{name + ' ' if named else ''}{here}{unit}, typically {usual}{unit}"
+
+
+def _apart(value: float, other: float) -> tuple[str, str]:
+    """Two numbers with as few digits as tell them apart, two at least and five at most."""
+    for digits in range(2, 6):
+        here, there = (
+            np.format_float_positional(x, digits, unique=False, fractional=False, trim="-")
+            for x in (value, other)
+        )
+        if here != there:
+            break
+    return here, there
 
 
 def phrase_of(name: str, high: bool) -> str:

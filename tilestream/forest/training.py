@@ -14,7 +14,14 @@ from tilestream.forest.domain import Domain, domain_of
 from tilestream.forest.intervals import LEVEL, NOT_CALIBRATED, Interval, calibrate
 from tilestream.forest.models import PAPER, Forest, Recipe, grow, telling, tuned
 from tilestream.forest.protocols import block_splits
-from tilestream.forest.reasons import contributions, in_words
+from tilestream.forest.reasons import (
+    PIECE,
+    Typical,
+    compared,
+    contributions,
+    in_words,
+    typical_of,
+)
 from tilestream.records import Column, Float64
 
 RECIPES = ("default", "paper")
@@ -63,7 +70,7 @@ PREDICTION_COLUMNS = (
         "place",
         "",
         "Why the estimate is high, the place strange, or there is no estimate; else empty.",
-        "contributions along the trees' paths",
+        "contributions along the trees' paths; factors on their bad side",
         dtype="str",
     ),
 )
@@ -77,7 +84,9 @@ class Model:
     forests: Mapping[str, Forest]
     """The forest of each target."""
     domain: Domain
-    """The training places."""
+    """The training places, by the features."""
+    typical: Typical
+    """The same, by all factors of the dataset: for reasons."""
     interval: Interval
     """The interval round `error_mean`."""
     factors: tuple[str, ...]
@@ -110,6 +119,8 @@ def train(
     if recipe not in RECIPES:
         raise UsageError(f"no recipe {recipe!r}: choose from {', '.join(RECIPES)}")
     dataset.check(MAIN)
+    pieces = dataset.rows.groupby(["path", dataset.rows["arc_length"] // PIECE]).ngroups
+    typical = typical_of(dataset.matrix(), dataset.label(MAIN), dataset.columns, pieces)
     dataset = dataset if recipe == "paper" else telling(dataset)
     grown = PAPER if recipe == "paper" else tuned(dataset, MAIN, seed, n_jobs)
     # An axis or a tail that is the same everywhere teaches nothing and is learnt as that constant.
@@ -119,6 +130,7 @@ def train(
     return Model(
         forests=forests,
         domain=domain_of(dataset.matrix(), rows["block"].to_numpy(str)),
+        typical=typical,
         interval=_interval(dataset, grown, seed, n_jobs),
         factors=tuple(dataset.names),
         made_with=dataset.made_with,
@@ -170,19 +182,20 @@ def predict(
     Args:
         model: a trained or loaded model.
         factors: a table with the model's factors; `heading` too where factors in map axes
-            are turned into the route's (`dataset.IN_MAP_AXES`).
-        made_with: what these factors were computed with (`dataset.made_with`); compared with the
-            model's. None: the caller vouches for it.
+            are turned into the route's (`dataset.IN_MAP_AXES`). Other factors of the dataset that
+            the model was trained on (`model.typical`) serve the reasons, as far as they are there.
+        made_with: what these factors were computed with; compared with the model's
+            (`check_making`). None: the caller vouches for it.
 
     Returns:
         `PREDICTION_COLUMNS` on the index of `factors`; targets without labels are NaN.
 
     Raises:
-        ModelError: a factor that the table lacks or that is no number, another sensor, cell size or
-            unit; says which.
+        ModelError: a factor that the table lacks or that is no number, or factors of another
+            making; says which.
     """
     if made_with is not None:
-        _same_making(model, made_with)
+        check_making(model, made_with)
     table = with_derived(factors)
     X = _matrix(model, table)
     good = np.asarray(np.isfinite(X).all(axis=1))
@@ -212,7 +225,29 @@ def _matrix(model: Model, table: pd.DataFrame) -> Float64:
     return np.ascontiguousarray(table[list(model.factors)].to_numpy(np.float64))
 
 
-def _same_making(model: Model, made_with: Mapping[str, Any]) -> None:
+def check_making(model: Model, made_with: Mapping[str, Any]) -> None:
+    """Refuse factors that were computed otherwise than those that a model was trained on.
+
+    Args:
+        model: a trained or loaded model.
+        made_with: what the factors were computed with: `dataset.made_with`, and what else the job
+            knows (height of the lidar, thinning of the map, how the virtual drive sees).
+
+    Raises:
+        ModelError: names what differs, and says what to do.
+    """
+    if "seeing" in model.made_with and "seeing" not in made_with:
+        raise ModelError("the model needs the virtual drive: give observe in the config")
+    if "seeing" in made_with and "seeing" not in model.made_with:
+        raise ModelError(
+            "the model was trained without the virtual drive: give observe: null in the config"
+        )
+    unsaid = sorted(set(made_with) - set(model.made_with))
+    if unsaid:
+        raise ModelError(
+            f"the model does not say for which {' and '.join(unsaid)} it was trained, as those of "
+            "older versions do not: train it again"
+        )
     for name in sorted(set(model.made_with) | set(made_with)):
         trained, given = model.made_with.get(name), made_with.get(name)
         if name == "units" and isinstance(trained, Mapping) and isinstance(given, Mapping):
@@ -256,13 +291,13 @@ def _reasons(
     worst = np.flatnonzero(good & (estimate > model.worst))
     if worst.size:
         added = contributions(model.forests[MAIN].trees, X[worst])
-        words[worst] = in_words(added, X[worst], model.domain.middle, model.factors)
+        values = _values(table.iloc[worst], model.typical.names)
+        words[worst] = in_words(added, model.factors, values, model.typical)
     strange = np.flatnonzero(good & ~in_domain)
     for row, k in zip(strange, model.domain.farthest(X[strange]), strict=True):
-        unlike = (
-            f"unlike the training places ({model.factors[k]} {X[row, k]:.3g}, typically "
-            f"{model.domain.middle[k]:.3g})"
-        )
+        which = model.typical.names.index(model.factors[k])
+        figures = compared(which, X[row, k], model.typical, named=True)
+        unlike = f"unlike the training places ({figures})"
         words[row] = f"{words[row]}; {unlike}" if words[row] else unlike
     given = table["reason"].fillna("").astype(str).to_numpy() if "reason" in table else None
     for row in np.flatnonzero(~good):
@@ -270,3 +305,12 @@ def _reasons(
         why = f"no estimate: {bad[0]} is not a number"
         words[row] = f"{why}: {given[row]}" if given is not None and given[row] else why
     return [str(word) for word in words]
+
+
+def _values(table: pd.DataFrame, names: Sequence[str]) -> Float64:
+    """(n, f) factors for reasons; NaN where the table has none of that name, or no numbers."""
+    values = np.full((len(table), len(names)), np.nan)
+    for k, name in enumerate(names):
+        if name in table and table[name].dtype.kind in "iufb":
+            values[:, k] = table[name].to_numpy(np.float64)
+    return values
