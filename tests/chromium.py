@@ -166,3 +166,58 @@ async def _connect(port: int) -> WebSocketClientConnection:
 async def _get(url: str) -> list[dict[str, Any]]:
     answer = await AsyncHTTPClient().fetch(url)
     return list(json.loads(answer.body))
+
+
+def opened(browser: Page, page: Path) -> Page:
+    """A report without a network, its charts drawn."""
+    browser.errors.clear()
+    browser.requests.clear()
+    browser.command("Network.emulateNetworkConditions", offline=True, latency=0,
+                    downloadThroughput=0, uploadThroughput=0)  # fmt: skip
+    browser.command("Emulation.setDeviceMetricsOverride", width=1280, height=900,
+                    deviceScaleFactor=1, mobile=False)  # fmt: skip
+    browser.goto(page.as_uri())
+    browser.wait_for("document.documentElement.dataset.charts")
+    return browser
+
+
+def calm(browser: Page) -> None:
+    """Nothing failed, and nothing was asked for but the file and what is inside it."""
+    assert browser.errors == []
+    assert {url.split(":", 1)[0] for url in browser.requests} <= {"file", "data", "blob"}
+    assert sum(url.startswith("file:") for url in browser.requests) == 1
+
+
+TIPS = """(() => {
+  const found = [];
+  const walk = (node) => {
+    if (node.classList && node.classList.contains("bk-Tooltip") && node.shadowRoot)
+      found.push([...node.shadowRoot.children].filter((c) => c.tagName != "STYLE")
+        .map((c) => c.innerText).join(""));
+    if (node.shadowRoot) walk(node.shadowRoot);
+    for (const child of node.children || []) walk(child);
+  };
+  walk(document.body);
+  return found.join("\\n").replaceAll("\\u00a0", " ").trim();
+})()"""
+"""What the tips say that are shown."""
+
+
+def point_at(browser: Page, chart: str, kind: str, row: int) -> None:
+    """Move the mouse onto a row of a data source."""
+    view = f"[...Bokeh.index.roots].find((v) => document.getElementById({chart!r}).contains(v.el))"
+    browser.wait_for(f"{view}.frame.bbox.width > 100")
+    browser.evaluate(f"{view}.el.scrollIntoView({{block: 'center', behavior: 'instant'}})")
+    y = "anchor" if kind == "estimate" else "y"
+    x, y = browser.evaluate(
+        f"""(() => {{
+          const view = {view};
+          const found = [...view.model.references()].find((m) => m.name == {kind!r});
+          const box = view.el.getBoundingClientRect();
+          const at = found.data.{"arc" if kind == "estimate" else "x"}[{row}];
+          return [box.left + view.frame.x_scale.compute(at),
+                  box.top + view.frame.y_scale.compute(found.data.{y}[{row}])];
+        }})()"""
+    )
+    browser.command("Input.dispatchMouseEvent", type="mouseMoved", x=x - 1, y=y)
+    browser.command("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)

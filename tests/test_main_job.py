@@ -7,8 +7,10 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 import streets
@@ -21,6 +23,7 @@ from tilestream.cli.tables import forecast_rows
 from tilestream.dataflow import estimate_tasks, main_job
 from tilestream.dataflow.calibration import calibration_file, core_hours, learn
 from tilestream.dataflow.main_forecast import forecast
+from tilestream.dataflow.main_plan import check_model, making_of
 from tilestream.dataflow.run import dask_client
 from tilestream.dataflow.run_settings import (
     DriveSettings,
@@ -36,6 +39,8 @@ from tilestream.dataflow.tasks import Outcome
 from tilestream.errors import ModelError, PartialError, SourceNotFoundError, UsageError
 from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.forest import evaluation, models, training
+from tilestream.forest.dataset import TARGETS
+from tilestream.forest.model_file import load_model, save_model
 from tilestream.forest.models import Recipe
 from tilestream.forest.training import PREDICTION_COLUMNS
 from tilestream.simulation.settings import load_preset
@@ -161,11 +166,20 @@ def test_the_evaluation_has_every_protocol_and_opponent(done: tuple[Path, Told])
     judged = protocols[protocols["reason"] == ""]
     assert set(judged["model"]) == set(models.COMPETITORS) - set(models.PHYSICS)
     assert {"paper", "path"} <= set(judged["protocol"])
+    assert set(protocols["protocol"]) == {"paper", "path", "blocks"}
+    blocks = protocols[protocols["protocol"] == "blocks"]
+    assert set(blocks["model"]) == set(judged["model"])
+    assert (blocks["reason"] != "").all() or np.isfinite(blocks["mae"]).all()
     for row in judged.itertuples():
         assert 0.0 <= row.mae <= row.rmse
     sets = set(pd.DataFrame(found["table_iv"])["factors"])
     assert sets == {"FS", "FS+RQ", "FS+RQ+LY", "FS+RQ+LY+LS", "all + robust"}
-    assert {row["target"] for row in found["parts"]} == {"error_tail", "p_fail"}
+    parts = pd.DataFrame(found["parts"])
+    assert set(parts["target"]) == set(TARGETS) - {"error_mean"}
+    assert set(parts["model"]) == {"default", "training median"}
+    on_paths = parts[parts["protocol"] == "path"].set_index("target")
+    assert on_paths.loc["error_tail", "reason"].str.contains("nothing to learn").all()
+    assert (on_paths.drop("error_tail")["mae"] >= 0.0).all()  # all starts here are within 1 m
     assert found["ceilings"] == {}
 
 
@@ -302,14 +316,84 @@ def test_a_model_is_applied_to_another_map(
     pd.testing.assert_series_equal(here["estimate"], there["estimate"], check_exact=True)
 
 
-def test_a_model_of_another_sensor_is_refused_by_name(
-    inputs: Path, done: tuple[Path, Told], tmp_path: Path
-) -> None:
-    use = {"use": str(done[0] / "model.skops")}
+@pytest.fixture
+def elsewhere(inputs: Path, done: tuple[Path, Told], tmp_path: Path) -> dict[str, object]:
+    """A job that uses the model of `done`, which it may do."""
     routes = [str(inputs / "canyon.mcap")]
-    settings = job(inputs, tmp_path / "run", model=use, drives=[], routes=routes, sensor="OS1_128")
-    with pytest.raises(PartialError, match=r"sensor does not match.*VLP16.*OS1_128"):
-        ts.run(settings)
+    return {"drives": [], "routes": routes, "model": {"use": str(done[0] / "model.skops")}}
+
+
+def refused(settings: RunSettings, error: type[Exception], said: str) -> None:
+    """The job is refused by `run` and by `plan`, and nothing is begun."""
+    told = Told()
+    with pytest.raises(error, match=said):
+        ts.run(settings, watch=told)
+    with pytest.raises(error, match=said):
+        forecast(settings)
+    assert told.outcomes == []
+    assert not settings.folder.exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"sensor": "OS1_128"}, r"sensor does not match in .*name.*VLP16.*OS1_128"),
+        ({"cell_size": 1.0}, r"cell_size does not match: .* 2\.0, .* 1\.0"),
+        ({"sensor_height": 2.5}, r"sensor_height does not match: .* 2\.0, .* 2\.5"),
+        ({"map_leaf": 0.1}, r"map_leaf does not match: .* 0\.2, .* 0\.1"),
+        ({"observe": {"range_max": 20.0}}, r"seeing does not match in range_max: .* 14\.0.* 20\.0"),
+        ({"label": {"matcher": "autoware"}}, r"matcher does not match in .*solver"),
+        ({"observe": None}, "needs the virtual drive: give observe in the config"),
+    ],
+)
+def test_a_model_of_another_making_is_refused_by_name(
+    inputs: Path,
+    elsewhere: dict[str, object],
+    tmp_path: Path,
+    changes: dict[str, object],
+    said: str,
+) -> None:
+    seen = {"observe": {"range_max": 14.0}, "label": {"matcher": "default"}}
+    fitting = job(inputs, tmp_path / "run", **(elsewhere | seen))
+    path = tmp_path / "seeing.skops"
+    made = load_model(fitting.model.use)
+    save_model(replace(made, made_with=json.loads(json.dumps(making_of(fitting)))), path)
+    elsewhere |= seen | {"model": {"use": str(path)}}
+    check_model(job(inputs, tmp_path / "run", **elsewhere))
+    if "map_leaf" in changes:
+        sources = {"sources": [str(inputs / "map_*.pcd")], "tile_size": 50.0}
+        changes = {"map": sources | changes}
+    refused(job(inputs, tmp_path / "run", **(elsewhere | changes)), ModelError, f"{path}: .*{said}")
+
+
+def test_a_model_without_the_virtual_drive_says_so(
+    inputs: Path, elsewhere: dict[str, object], tmp_path: Path
+) -> None:
+    settings = job(inputs, tmp_path / "run", **elsewhere, observe={})
+    refused(settings, ModelError, r"without the virtual drive: give observe: null")
+
+
+def test_an_old_a_foreign_and_a_missing_model_are_refused_before_anything_runs(
+    inputs: Path, elsewhere: dict[str, object], tmp_path: Path
+) -> None:
+    path = tmp_path / "other.skops"
+    settings = job(inputs, tmp_path / "run", **(elsewhere | {"model": {"use": str(path)}}))
+    refused(settings, SourceNotFoundError, rf"{path}: no such model file; see model\.use")
+    path.write_bytes(b"\x80\x04K\x01.")
+    refused(settings, ModelError, rf"^{path}: no model file of tilestream")
+    made = load_model(str(elsewhere["model"]["use"]))
+    old = {k: v for k, v in made.made_with.items() if k not in ("map_leaf", "sensor_height")}
+    save_model(replace(made, made_with=old), path)
+    refused(settings, ModelError, "does not say for which map_leaf and sensor_height .*train it ag")
+
+
+def test_the_thinning_of_a_map_that_is_there_counts(
+    done: tuple[Path, Told], elsewhere: dict[str, object], tmp_path: Path
+) -> None:
+    store = {"store": str(done[0] / "map.zarr"), "map_leaf": 0.7}
+    settings = RunSettings(out=str(tmp_path / "run"), observe=None, map=store, **elsewhere)
+    assert making_of(settings)["map_leaf"] == 0.2  # as the store has it
+    check_model(settings)
 
 
 # --- The virtual drive

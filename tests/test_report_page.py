@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from chromium import Page, chromium_page
+from chromium import TIPS, Page, calm, chromium_page, opened, point_at
 from report_findings import (
     HOSTILE,
     LIMIT,
@@ -235,7 +235,11 @@ def test_the_parts_of_the_error_are_judged_beside_a_repeated_drive(page: Path) -
     assert parts.endswith(f"{again} 2.10 % 0.70 0.81")
     assert parts.count(again) == 1  # the ceiling of the others is not known
     alone = html.unescape(TAGS.sub(" ", protocols(replace(whole(), parts=pd.DataFrame()))))
-    assert "Not judged in this run: nothing judged them." in alone
+    assert "Not judged in this run." in alone
+    same = whole().parts.replace({"target": {"error_tail": "error_floor"}})
+    same.loc[same["target"] == "error_floor", ["mae", "reason"]] = [np.nan, "all are 0"]
+    text = " ".join(TAGS.sub(" ", protocols(replace(whole(), parts=same))).split())
+    assert "floor: what starts within 1 m end with not followed: all are 0 – – –" in text
 
 
 def test_the_parts_stand_below_the_estimate_of_a_worst_place(found: Findings, page: Path) -> None:
@@ -294,59 +298,6 @@ def test_the_page_asks_for_nothing_from_outside(page: Path) -> None:
 def browser() -> Iterator[Page]:
     with chromium_page() as tab:
         yield tab
-
-
-def opened(browser: Page, page: Path) -> Page:
-    browser.errors.clear()
-    browser.requests.clear()
-    browser.command("Network.emulateNetworkConditions", offline=True, latency=0,
-                    downloadThroughput=0, uploadThroughput=0)  # fmt: skip
-    browser.command("Emulation.setDeviceMetricsOverride", width=1280, height=900,
-                    deviceScaleFactor=1, mobile=False)  # fmt: skip
-    browser.goto(page.as_uri())
-    browser.wait_for("document.documentElement.dataset.charts")
-    return browser
-
-
-def calm(browser: Page) -> None:
-    """Nothing failed, and nothing was asked for but the file and what is inside it."""
-    assert browser.errors == []
-    assert {url.split(":", 1)[0] for url in browser.requests} <= {"file", "data", "blob"}
-    assert sum(url.startswith("file:") for url in browser.requests) == 1
-
-
-TIPS = """(() => {
-  const found = [];
-  const walk = (node) => {
-    if (node.classList && node.classList.contains("bk-Tooltip") && node.shadowRoot)
-      found.push([...node.shadowRoot.children].filter((c) => c.tagName != "STYLE")
-        .map((c) => c.innerText).join(""));
-    if (node.shadowRoot) walk(node.shadowRoot);
-    for (const child of node.children || []) walk(child);
-  };
-  walk(document.body);
-  return found.join("\\n").replaceAll("\\u00a0", " ").trim();
-})()"""
-
-
-def point_at(browser: Page, chart: str, kind: str, row: int) -> None:
-    """Move the mouse onto a row of a data source."""
-    view = f"[...Bokeh.index.roots].find((v) => document.getElementById({chart!r}).contains(v.el))"
-    browser.wait_for(f"{view}.frame.bbox.width > 100")
-    browser.evaluate(f"{view}.el.scrollIntoView({{block: 'center', behavior: 'instant'}})")
-    y = "anchor" if kind == "estimate" else "y"
-    x, y = browser.evaluate(
-        f"""(() => {{
-          const view = {view};
-          const found = [...view.model.references()].find((m) => m.name == {kind!r});
-          const box = view.el.getBoundingClientRect();
-          const at = found.data.{"arc" if kind == "estimate" else "x"}[{row}];
-          return [box.left + view.frame.x_scale.compute(at),
-                  box.top + view.frame.y_scale.compute(found.data.{y}[{row}])];
-        }})()"""
-    )
-    browser.command("Input.dispatchMouseEvent", type="mouseMoved", x=x - 1, y=y)
-    browser.command("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
 
 
 def test_a_browser_shows_every_chart_and_answers_to_the_mouse(

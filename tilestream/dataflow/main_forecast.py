@@ -9,6 +9,7 @@ from tilestream.dataflow.ingest_map import plan_ingest
 from tilestream.dataflow.ingest_tasks import ScatterTask
 from tilestream.dataflow.main_plan import (
     Inputs,
+    check_model,
     extent,
     ingest_settings,
     inputs_of,
@@ -45,8 +46,9 @@ def forecast(settings: RunSettings) -> Forecast:
 
     Raises:
         PlanError: a task does not fit `memory`.
-        UsageError, SourceError, StoreError: as the job itself.
+        UsageError, SourceError, StoreError, ModelError: as the job itself.
     """
+    check_model(settings)
     if settings.simulate is not None and not is_simulated(settings):
         return _simulation_first(settings, settings.simulate)
     inputs = inputs_of(settings, None, None)
@@ -54,7 +56,7 @@ def forecast(settings: RunSettings) -> Forecast:
     measure = plan_measure(settings, inputs, store, (), have)
     done = [Outcome(task.key, task.stage, None) for task in measure.tasks]
     estimate = plan_estimate(settings, store.grid, measure, done)
-    return Forecast((*reading, *measure.tasks, *estimate.tasks), tuple(notes))
+    return Forecast((*reading, *measure.tasks, *estimate.tasks), (*notes, *inputs.notes))
 
 
 def _simulation_first(settings: RunSettings, wanted: SimulateSettings) -> Forecast:

@@ -16,6 +16,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,14 @@ from tilestream.dataflow.factors_tasks import FactorsTask
 from tilestream.dataflow.ingest_map import SourcesRead
 from tilestream.dataflow.localize_tasks import LabelTask, RegisterTask
 from tilestream.dataflow.main_findings import Done, findings_of
-from tilestream.dataflow.main_plan import Inputs, inputs_of, plan_estimate, plan_measure, read_map
+from tilestream.dataflow.main_plan import (
+    Inputs,
+    check_model,
+    inputs_of,
+    plan_estimate,
+    plan_measure,
+    read_map,
+)
 from tilestream.dataflow.observe_tasks import ObserveTask
 from tilestream.dataflow.plan import Plan, Task
 from tilestream.dataflow.run import Watch, execute, report_kept
@@ -44,10 +52,13 @@ from tilestream.dataflow.run_settings import RunSettings, read_settings
 from tilestream.dataflow.tasks import Outcome
 from tilestream.errors import PartialError, UsageError
 from tilestream.forest.dataset import Dataset
+from tilestream.forest.model_file import load_model
 from tilestream.report import write_report
 from tilestream.tables import remove_others
 from tilestream.version import VERSION
 
+WRITE_EVERY = 30.0
+"""How often `run.json` is written while tasks end [s]."""
 LARGE = 50_000
 """Measured places from which on a forest is grown by all workers together."""
 
@@ -57,45 +68,74 @@ class _Book:
     """What a run did so far; `run.json` is made from it."""
 
     folder: Path
+    earlier: Mapping[str, Any] = field(default_factory=dict)
+    """What it said after the calls before this one."""
     began: float = field(default_factory=time.time)
+    written: float = 0.0
     tasks: list[Task] = field(default_factory=list)
     outcomes: list[Outcome] = field(default_factory=list)
     failures: dict[str, str] = field(default_factory=dict)
     facts: dict[str, Any] = field(default_factory=dict)
 
-    def note(self, tasks: Iterable[Task], outcomes: Iterable[Outcome]) -> None:
-        """Enter what ran."""
-        ended = list(outcomes)
+    def listening(self, tasks: Iterable[Task], watch: Watch | None) -> Watch:
+        """What enters the outcomes of these tasks as they end, and tells `watch` of them.
+
+        It is written now and then, so that a call that is killed has told what it cost.
+        """
         self.tasks += tasks
-        self.outcomes += ended
-        self.failures |= {outcome.key: outcome.reason for outcome in ended if not outcome.ok}
+
+        def hear(outcome: Outcome, ended: int, total: int) -> None:
+            self.outcomes.append(outcome)
+            if not outcome.ok:
+                self.failures[outcome.key] = outcome.reason
+            if time.time() - self.written > WRITE_EVERY:
+                self.write("running")
+            if watch is not None:
+                watch(outcome, ended, total)
+
+        return hear
 
     def write(self, state: str) -> dict[str, Any]:
         """Write `run.json`: whole, or as it was."""
         content = {
             "state": state,
             "tilestream": VERSION,
-            "python": platform.python_version(),
-            "numpy": np.__version__,
-            "cores": os.cpu_count(),
+            **machine(),
             "began": datetime.fromtimestamp(self.began, UTC).isoformat(timespec="seconds"),
             "seconds": round(time.time() - self.began, 1),
+            "calls": self.calls,
+            "seconds_of_all_calls": self.seconds(),
             "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1000,
             "stages": self.stages(),
             "failures": self.failures,
             **self.facts,
         }
         _write_text(self.folder / "run.json", json.dumps(content, indent=2, default=str) + "\n")
+        self.written = time.time()
         return content
 
+    @property
+    def calls(self) -> int:
+        """How often the job was called on this run directory, this call included."""
+        return int(self.earlier.get("calls", 0)) + 1
+
+    def seconds(self) -> float:
+        """How long all calls took [s]."""
+        before = float(self.earlier.get("seconds_of_all_calls", 0.0))
+        return round(before + time.time() - self.began, 1)
+
     def stages(self) -> dict[str, dict[str, float]]:
-        """Tasks, failures, work and core-seconds of each stage."""
+        """Tasks, failures and work of each stage in this call; its core-seconds in all calls."""
         work = {task.key: task.work for task in self.tasks}
-        table: dict[str, dict[str, float]] = {}
+        nothing = {"tasks": 0, "failed": 0, "work": 0, "core_seconds": 0.0}
+        before: dict[str, Any] = self.earlier.get("stages", {})
+        order = dict.fromkeys([*before, *(task.stage for task in self.tasks)])
+        table = {
+            stage: nothing | {"core_seconds": before.get(stage, nothing)["core_seconds"]}
+            for stage in order
+        }
         for outcome in self.outcomes:
-            row = table.setdefault(
-                outcome.stage, {"tasks": 0, "failed": 0, "work": 0, "core_seconds": 0.0}
-            )
+            row = table[outcome.stage]
             row["tasks"] += 1
             row["failed"] += not outcome.ok
             row["work"] += work[outcome.key]
@@ -113,8 +153,8 @@ def run(
     Writes a run directory: `map.zarr/`, `tables/` (Parquet with documented columns: `factors`,
     `observability`, `starts`, `errors`, `samples`, `judged`, `predictions`), `model.skops`,
     `report/` (`index.html` and its data), `config.yaml` (the effective one), `run.json` (versions,
-    times, counts, failures). A job that was killed continues when it is called again; what changed
-    is redone with what depends on it.
+    times over all calls, counts, failures). A job that was killed continues when it is called
+    again; what changed is redone with what depends on it.
 
     Args:
         config: the settings, or a YAML file of them.
@@ -127,11 +167,13 @@ def run(
     Raises:
         UsageError: settings that cannot be.
         SourceError, StoreError: an input that is not there or cannot be read.
-        ModelError: a model in use that does not fit the factors; says what differs.
+        ModelError: a model in use that does not fit the job, before anything runs; says what
+            differs.
         PlanError: a task does not fit `memory`.
         PartialError: some tasks failed; the message lists them, the rest is done and reported.
     """
     settings = config if isinstance(config, RunSettings) else read_settings(config)
+    check_model(settings)
     book = _begin(settings)
     with report_kept(client, settings.folder / "dask-performance.html"):
         inputs = inputs_of(settings, client, watch)
@@ -140,8 +182,7 @@ def run(
         _forget_others(settings, measure)
         measured = _measure(read, measure, client, watch, book)
         estimate = plan_estimate(settings, read.store.grid, measure, measured)
-        estimated = _estimate(estimate, client, watch)
-        book.note(estimate.tasks, estimated)
+        _estimate(estimate, client, book.listening(estimate.tasks, watch))
     learn(book.tasks, book.outcomes)
     _report(settings, inputs, read, measure, estimate, book)
     book.write("failed" if book.failures else "done")
@@ -178,9 +219,18 @@ def _begin(settings: RunSettings) -> _Book:
         ) from None
     text = yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
     _write_text(settings.folder / "config.yaml", text)
-    book = _Book(settings.folder)
+    book = _Book(settings.folder, _told_before(settings.folder / "run.json"))
     book.write("running")
     return book
+
+
+def _told_before(path: Path) -> dict[str, Any]:
+    """The book of earlier calls; empty where there is none, or none of this kind."""
+    try:
+        told = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    return told if isinstance(told, dict) and "calls" in told else {}
 
 
 def _write_text(path: Path, text: str) -> None:
@@ -209,6 +259,7 @@ def _measure(
     """Run the tasks up to the labels; the map is closed as soon as its last tile is written."""
     open_tiles = {task.key for task in read.merges.tasks}
     written: list[Outcome] = []
+    told = book.listening(plan.tasks, watch)
 
     def watching(outcome: Outcome, ended: int, total: int) -> None:
         if outcome.key in open_tiles:
@@ -217,17 +268,14 @@ def _measure(
                 order = {task.key: n for n, task in enumerate(read.merges.tasks)}
                 failures = read.close(sorted(written, key=lambda o: order[o.key]))
                 book.failures |= failures
-        if watch is not None:
-            watch(outcome, ended, total)
+        told(outcome, ended, total)
 
     if not open_tiles:
         book.failures |= read.close([])
-    outcomes = execute(plan.tasks, client, watching)
-    book.note(plan.tasks, outcomes)
-    return outcomes
+    return execute(plan.tasks, client, watching)
 
 
-def _estimate(plan: Plan, client: Any | None, watch: Watch | None) -> list[Outcome]:
+def _estimate(plan: Plan, client: Any | None, watch: Watch) -> list[Outcome]:
     """Run the tasks from the dataset to the estimates.
 
     A forest of very many places is grown by all workers together, through joblib: the same trees.
@@ -292,25 +340,47 @@ def remove_unknown(finished: Sequence[Task]) -> None:
 def _facts(
     settings: RunSettings, inputs: Inputs, book: _Book, known: Dataset | None
 ) -> dict[str, Any]:
-    """What a reader of the report must know of the run."""
-    registration = settings.label.registration.model_dump()
+    """What a reader of the report must know of the run, and what makes the same figures again."""
     stages = {name: f"{row['core_seconds']:.1f} s" for name, row in book.stages().items()}
+    effective = settings.model_dump(mode="json", exclude={"drives", "out"})
     return {
-        "tilestream": VERSION,
+        **machine(),
+        "wall time, all calls [s]": book.seconds(),
+        "calls": book.calls,
         "map": settings.store_url,
         "sensor": settings.looking_sensor.name,
-        "cell size [m]": settings.cell_size,
-        "spacing [m]": settings.spacing,
-        "drives": [drive.group for drive in inputs.drives],
         "labelled places": 0 if known is None else len(known),
         "lost labels": {} if known is None else known.losses,
-        "model": settings.model.use or f"trained here, recipe {settings.model.recipe}",
-        "matcher": registration,
-        "core-seconds by stage": stages,
+        "model": _model_facts(settings, book),
+        "matcher": settings.label.registration.model_dump(),
+        "settings": effective,
+        "drives": {d.group: d.model_dump(exclude_defaults=True) for d in inputs.drives},
+        "core-seconds by stage, all calls": stages,
         "failures": dict(book.failures),
         "notes": list(inputs.notes),
         "attributions": list(inputs.attributions),
     }
+
+
+def machine() -> dict[str, Any]:
+    """What the figures were computed with."""
+    return {
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "scikit-learn": version("scikit-learn"),
+        "cores": os.cpu_count(),
+    }
+
+
+def _model_facts(settings: RunSettings, book: _Book) -> dict[str, Any]:
+    """Where the model comes from, and how it was grown."""
+    if settings.model.recipe == "physics":
+        return {"from": "none: the virtual drive as it is", "offset [m]": settings.model.offset}
+    if settings.model.use is not None:
+        return {"from": settings.model.use, **load_model(settings.model.use).facts}
+    if not any(outcome.stage == TrainTask.stage and outcome.ok for outcome in book.outcomes):
+        return {"from": "none: it could not be trained", "recipe": settings.model.recipe}
+    return {"from": "trained here", **load_model(settings.folder / "model.skops").facts}
 
 
 def _plain(value: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from glob import glob
 from pathlib import Path
 from typing import Any
 
@@ -27,17 +28,24 @@ from tilestream.dataflow.localize_tasks import LabelTask, Reading
 from tilestream.dataflow.observe_tasks import ObserveTask, Observing
 from tilestream.dataflow.plan import Plan, Task
 from tilestream.dataflow.run import Watch
-from tilestream.dataflow.run_settings import DriveSettings, RunSettings, SimulateSettings
+from tilestream.dataflow.run_settings import (
+    DriveSettings,
+    ModelSettings,
+    RunSettings,
+    SimulateSettings,
+)
 from tilestream.dataflow.simulate import simulate
 from tilestream.dataflow.tasks import Outcome
-from tilestream.errors import SourceNotFoundError, UsageError
+from tilestream.errors import ModelError, SourceNotFoundError, UsageError
 from tilestream.factors import catalogue
 from tilestream.factors.rows import samples_by_tile
 from tilestream.factors.virtual_drive import NEIGHBOURS
 from tilestream.factors.virtual_scan import VirtualSettings
-from tilestream.forest.dataset import features_of, made_with
+from tilestream.forest.dataset import TARGETS, features_of, made_with
 from tilestream.forest.evaluation import factor_sets
-from tilestream.forest.models import COMPETITORS, OPPONENTS, PHYSICS
+from tilestream.forest.model_file import load_model
+from tilestream.forest.models import COMPETITORS, PHYSICS
+from tilestream.forest.training import MAIN, check_making
 from tilestream.formats.mcap import ScanSelection
 from tilestream.formats.routes import read_routes
 from tilestream.records import Route
@@ -46,9 +54,8 @@ from tilestream.store import TileStore, hash_of, open_store
 from tilestream.tiling import MM_PER_M, TileGrid, TileKey
 from tilestream.version import VERSION
 
-MAIN = "error_mean"
-PARTS = ("error_tail", "p_fail")
-"""What is judged beside the mean error: what a map can know of it, and the share that is lost."""
+OPPONENT = "training median"
+"""Whom a part of the error is judged against: the others know no more of unseen paths."""
 NEIGHBOURS_MM = round(NEIGHBOURS * MM_PER_M) + 1
 """How far from a tile a sample point of it may have neighbours, rounding included [mm]."""
 
@@ -73,12 +80,14 @@ def inputs_of(settings: RunSettings, client: Any | None, watch: Watch | None) ->
     """The files of a job; a simulated city is simulated first, as far as it is not there.
 
     Raises:
-        UsageError: two routes of one name.
+        UsageError: no routes, or two of one name.
         SourceError: a file that is not there or cannot be read.
     """
     if settings.simulate is None:
         drives = settings.drives
         files = settings.routes or tuple(dict.fromkeys(drive.log for drive in drives))
+        if not files:
+            return Inputs(settings.map.sources, drives, *_all_streets(settings))
         return Inputs(settings.map.sources, drives, _routes(files, settings))
     folder = simulated_folder(settings)
     wanted = settings.simulate
@@ -128,6 +137,30 @@ def simulated_folder(settings: RunSettings) -> Path:
     """Where a simulated city is kept."""
     assert settings.simulate is not None
     return Path(settings.simulate.folder or settings.folder / "simulation")
+
+
+LANES = "lanelet2_map.osm"
+"""The lanes that Autoware keeps beside the point clouds of a map."""
+
+
+def _all_streets(settings: RunSettings) -> tuple[tuple[Route, ...], tuple[str, ...]]:
+    """The lanes of the map directories among the sources, and what is to be told of them.
+
+    Raises:
+        UsageError: there are none.
+    """
+    found = [Path(name) for source in settings.map.sources for name in sorted(glob(source))]  # noqa: PTH207
+    files = [str(place / LANES) for place in found if (place / LANES).is_file()]
+    if not files:
+        raise UsageError(
+            f"{settings.out}: no routes: give files of routes, drives, or a map directory with "
+            f"{LANES} in map.sources"
+        )
+    lanes = _routes(files, settings)
+    long = tuple(lane for lane in lanes if lane.arc_length[-1] >= settings.spacing)
+    told = f"no routes were given: all streets of the map, {len(long)} lanes of {', '.join(files)}"
+    short = len(lanes) - len(long)
+    return long, (told + (f"; {short} shorter than the spacing are left out" if short else ""),)
 
 
 def _routes(files: Sequence[str], settings: RunSettings) -> tuple[Route, ...]:
@@ -253,13 +286,39 @@ def observing_of(settings: RunSettings, seeing: VirtualSettings) -> Observing:
 def making_of(settings: RunSettings) -> dict[str, Any]:
     """What the factors are made with, as a model remembers it."""
     making = made_with(COLUMNS, settings.looking_sensor, settings.cell_size)
+    making |= {"sensor_height": settings.sensor_height, "map_leaf": _map_leaf(settings)}
     if settings.observe is None:
         return making
     return making | {
         "seeing": settings.observe.model_dump(mode="json"),
         "matcher": settings.label.registration.model_dump(mode="json"),
-        "sensor_height": settings.sensor_height,
     }
+
+
+def _map_leaf(settings: RunSettings) -> float:
+    """How the map is thinned that the job makes, or was thinned that is there [m]."""
+    if settings.map.sources or settings.simulate is not None:
+        return settings.map.map_leaf
+    return open_store(settings.store_url).settings.map_leaf
+
+
+def check_model(settings: RunSettings) -> None:
+    """Refuse a model in use that cannot estimate these places, before anything is made or measured.
+
+    Raises:
+        SourceNotFoundError: there is no such file.
+        ModelError: the file is no model, or the model was trained for other factors; says which.
+        StoreNotFoundError: the map is to be there and is not.
+    """
+    if settings.model.use is None:
+        return
+    if not Path(settings.model.use).is_file():
+        raise SourceNotFoundError(f"{settings.model.use}: no such model file; see model.use")
+    try:
+        check_making(load_model(settings.model.use), making_of(settings))
+    except ModelError as error:
+        told = str(error).removeprefix(f"{settings.model.use}: ")
+        raise ModelError(f"{settings.model.use}: {told}") from None
 
 
 def reading_of(drive: DriveSettings) -> Reading:
@@ -331,10 +390,8 @@ def plan_estimate(
                     identity=state,
                 )
             )
-            tasks += judges(join, f"{tables}/judged", seed, bool(observed))
+            tasks += judges(join, f"{tables}/judged", settings.model, bool(observed))
     if settings.model.use is not None:
-        if not Path(settings.model.use).is_file():
-            raise SourceNotFoundError(f"{settings.model.use}: no such model file")
         model, state = settings.model.use, file_hash(settings.model.use)
     if settings.model.recipe == "physics":
         model, state = "", f"physics {settings.model.offset}"
@@ -360,20 +417,19 @@ def plan_estimate(
     return Plan(tuple(tasks), settings.memory).check()
 
 
-def judges(join: JoinTask, folder: str, seed: int, observed: bool) -> list[Task]:
+def judges(join: JoinTask, folder: str, model: ModelSettings, observed: bool) -> list[Task]:
     """Every model and opponent on all factors, the forests on each set of Table IV; the parts of
-    the error by ours and the simple opponents.
+    the error by the forest in use, the virtual drive and the training median.
     """
+    seed = model.seed
     columns = features_of(COLUMNS if observed else catalogue.COLUMNS)
     *sets, _ = factor_sets(columns)  # the last has all factors, as the competitors have
     known = [name for name in COMPETITORS if observed or name not in PHYSICS]
     wanted = [(MAIN, competitor, "") for competitor in known]
     wanted += [(MAIN, "paper", name) for name in sets]
     wanted += [(MAIN, "default", name) for name in sets if "LS" in name and "ob" not in name]
-    simple = ["default", *(name for name in known if name in (*PHYSICS, *OPPONENTS))]
-    wanted += [
-        (target, name, "") for target in PARTS for name in simple if name != "footprint forest"
-    ]
+    of_parts = [model.recipe, *(name for name in known if name in PHYSICS), OPPONENT]
+    wanted += [(target, name, "") for target in TARGETS if target != MAIN for name in of_parts]
     tasks: list[Task] = [
         JudgeTask(
             dataset=join.out,

@@ -148,7 +148,8 @@ class RunSettings(Settings):
     drives: tuple[DriveSettings, ...] = ()
     """The logs to measure on; empty with `simulate`: its drives."""
     routes: tuple[str, ...] = ()
-    """Files of routes to estimate along; empty: those of the simulation, or of the drives."""
+    """Files of routes to estimate along; empty: those of the simulation, or of the drives; without
+    drives, all lanes of a map directory with `lanelet2_map.osm` among the sources."""
     project_to: str | None = None
     """CRS for routes in degrees."""
     spacing: Positive = 1.0
@@ -187,7 +188,7 @@ class RunSettings(Settings):
             raise ValueError("has nothing to learn from: give drives, simulate, or model.use")
         if physics and (self.observe is None or self.model.use):
             raise ValueError("has model.recipe physics, which needs observe and no model.use")
-        if not (self.simulate or self.drives or self.routes):
+        if not (self.simulate or self.drives or self.routes or self.map.sources):
             raise ValueError("has no routes: give files of routes, or drives")
         return self
 

@@ -241,7 +241,15 @@ def _physics(train: Dataset, judged: Dataset, target: str, seed: int) -> Float64
     return np.maximum(judged.rows[seen].to_numpy(np.float64) + added, 0.0)
 
 
-VIRTUAL = {"error_mean": "vd_mean", "error_tail": "vd_tail", "p_fail": "vd_p_fail"}
+VIRTUAL = {
+    "error_mean": "vd_mean",
+    "error_tail": "vd_tail",
+    "error_floor": "vd_floor",
+    "along_mean": "vd_along",
+    "across_mean": "vd_across",
+    "up_mean": "vd_up",
+    "p_fail": "vd_p_fail",
+}
 """What the virtual drive says of each target."""
 PHYSICS: dict[str, Competitor] = {"physics": _physics}
 """An estimate without a forest, for datasets with the observability factors."""

@@ -195,26 +195,22 @@ def _parts(found: Findings) -> str:
     """How well the parts of the error are estimated on paths left out, beside a repeated drive."""
     title = "<h3>the parts of the error, on paths left out</h3>"
     rows = [row for name, rows in _by_protocol(found.parts) if name == "path" for row in rows]
-    judged = [row for row in rows if _judged(row)]
-    if not judged:
-        why = esc(rows[0].get("reason") or "no reason given") if rows else "nothing judged them"
-        return title + empty(f"Not judged in this run: {why}.")
+    if not rows:
+        return title + empty("Not judged in this run.")
+    head = ["part", "MAE", "skill", "Spearman"]
     groups = []
     for target, meaning in PARTS.items():
-        cells = [
-            [_model(row["model"]), *_of_part(target, row)]
-            for row in judged
-            if row["target"] == target
-        ]
+        here = [row for row in rows if row["target"] == target]
+        cells = [[_model(row["model"]), *_of_part(target, row)] for row in here if _judged(row)]
         if cells and target in found.ceilings:
             cells.append([AGAIN, *_of_part(target, found.ceilings[target])])
-        if cells:
-            groups.append((meaning, cells))
+        if here:
+            groups.append((meaning, cells or [_not_followed(here, len(head))]))
     text = (
         "<p>The skill is that over the training median; a part that a second drive cannot tell "
         "either is chance, not the map's.</p>"
     )
-    return title + text + grouped_table(["part", "MAE", "skill", "Spearman"], groups, "figures")
+    return title + text + grouped_table(head, groups, "figures")
 
 
 def _of_part(target: str, row: Mapping[str, Any]) -> list[str]:
