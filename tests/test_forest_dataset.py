@@ -227,7 +227,7 @@ def test_what_nothing_can_be_learnt_from_is_refused() -> None:
     few = join(factors, {"drive": labels.iloc[:49]}, COLUMNS)
     with pytest.raises(ModelError, match="49 labelled points, and a model needs 50"):
         few.check()
-    lonely = join(factors, {"drive": labels.iloc[:61]}, COLUMNS)
+    lonely = join(factors, {"drive": labels}, COLUMNS).take(np.arange(61))
     with pytest.raises(ModelError, match="path 'b' has one point only"):
         lonely.check()
     with pytest.raises(ModelError, match="one block only"):
@@ -236,6 +236,22 @@ def test_what_nothing_can_be_learnt_from_is_refused() -> None:
         leave_path_out(few)
     with pytest.raises(ModelError, match="the labels have no nonsense"):
         few.label("nonsense")
+
+
+def test_a_label_alone_on_its_path_is_lost_and_stops_nothing() -> None:
+    factors, labels = drives(0, {"a": 60, "b": 60})
+    end = join(factors, {"drive": labels.iloc[:61]}, COLUMNS)
+    end.check()
+    assert len(end) == 60
+    assert end.losses == {"the only label of its path": 1}
+    assert end.lost["sample"].tolist() == [60]
+    twice = {"one": labels.iloc[:61], "two": labels.iloc[60:61]}
+    assert join(factors, twice, COLUMNS).losses == {"the only label of its path": 2}
+    apart = {"one": labels.iloc[:61], "two": labels.iloc[60:62]}
+    assert join(factors, apart, COLUMNS).losses == {}
+    nothing = join(factors, {"drive": labels.iloc[[3]]}, COLUMNS)
+    with pytest.raises(ModelError, match=r"0 labelled points.*1 the only label of its path"):
+        nothing.check()
 
 
 def test_broken_tables_are_refused(short: tuple[pd.DataFrame, pd.DataFrame]) -> None:

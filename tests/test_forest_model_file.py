@@ -180,7 +180,7 @@ def usual(names: list[str], middle: list[float], rho: list[float], unit: str = "
     """What is typical, with quartiles 10 % of the median away."""
     spread = 0.1 * np.array(middle)
     units = tuple("m" if name in ("vd_mean", "vd_along") else unit for name in names)
-    return Typical(tuple(names), units, np.array(middle), spread, spread, np.array(rho))
+    return Typical(tuple(names), units, np.array(middle), spread, spread, np.array(rho), 0.15)
 
 
 def test_reasons_are_words_for_what_raises_the_estimate() -> None:
@@ -213,11 +213,11 @@ def test_a_symptom_is_followed_by_causes_in_the_map() -> None:
         "D2_count",
     ]
     middle = [0.05, 0.04, 9000.0, 0.8, 4.6, 2.2, 50.0]
-    typical = usual(names, middle, [0.8, 0.7, -0.4, 0.3, -0.2, 0.0, -0.3])
+    typical = usual(names, middle, [0.8, 0.7, -0.4, 0.3, -0.2, 0.1, -0.3])
     X = np.array([[0.892, 0.5, 600.0, 0.81, 4.0, 3.0, 60.0]])
     added = np.array([[0.5, 0.2, 0.01, 0.02]])
     (words,) = in_words(added, names[:4], X, typical)
-    # ob_returns is as usual, sight_HDOP has no bad side, D2_count lies on its good one.
+    # ob_returns is as usual, sight_HDOP has no clear side, D2_count lies on its good one.
     assert words == (
         "a virtual drive does not hold its place (89\u00a0cm, typically 5\u00a0cm); "
         "nothing fixes the direction of travel (ob_info_along 600, typically 9000); "
@@ -267,9 +267,10 @@ def test_what_is_typical_has_quartiles_and_a_bad_side() -> None:
     columns = [Column(name, "FS", "1", "", "") for name in "abcd"]  # type: ignore[arg-type]
     found = typical_of(X, error, columns, 400)
     weak = spearmanr(X[:, 1], error).statistic
-    assert 0.15 < weak < 0.4
-    assert found.rho == pytest.approx([-1.0, weak, 0.0, 0.0])
-    assert typical_of(X, error, columns, 25).rho == pytest.approx([-1.0, 0.0, 0.0, 0.0])
+    often = spearmanr(rare, error).statistic
+    assert found.rho == pytest.approx([-1.0, weak, 0.0, often])
+    assert found.clear == 0.15
+    assert typical_of(X, error, columns, 25).clear == pytest.approx(0.4)
     low, middle, high = np.percentile(X[:, 0], [25, 50, 75])
     assert found.middle[0] == pytest.approx(middle)
     values = np.array([[low, 0.0, 99.0, 0.0], [high, np.inf, 16.0, 1.0], [np.nan] * 4])
@@ -302,9 +303,9 @@ def test_the_worst_places_name_a_cause_in_the_map() -> None:
     worst = factors[found["estimate"] > model.worst]
     reasons = found.loc[worst.index, "reason"].str.split("; unlike").str[0]
     assert reasons.str.startswith("a virtual drive does not hold its place (").all()
-    bad = typical.rho * typical.out(worst[list(typical.names)].to_numpy())
+    out = np.sign(typical.rho) * typical.out(worst[list(typical.names)].to_numpy())
     own = [name in NAMES for name in typical.names]
-    far = (bad[:, own] >= 1.2 * np.abs(typical.rho[own])) & (typical.rho[own] != 0.0)
+    far = (out[:, own] >= 1.2) & (np.abs(typical.rho[own]) >= typical.clear)
     phrases = [phrase_of(n, bool(r > 0.0)) for n, r in zip(NAMES, typical.rho[own], strict=True)]
     causes = far & ~np.isin(phrases, list(REASSURING))
     assert causes.any(axis=1).sum() > 150

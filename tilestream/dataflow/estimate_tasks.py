@@ -28,7 +28,7 @@ from tilestream.tables import is_done, read_mark, read_tables, write_table
 from tilestream.tiling import TileKey
 from tilestream.version import VERSION
 
-JOIN_VERSION = 2
+JOIN_VERSION = 3
 """Raise it when the dataset that is joined from the same tables changes."""
 TRAIN_VERSION = 2
 """Raise it when the model or the judgement that is made from the same dataset changes."""

@@ -31,6 +31,8 @@ BLOCK = 200.0
 """Least length of a block [m]: twice the range of a vicinity."""
 SAME = 1e-3
 """Distances this close are equal [m]: the resolution of the map."""
+LONE = "the only label of its path"
+"""Why a label alone on its path is lost."""
 POINTS_MIN = 50
 """Fewest labelled points that a model is trained on."""
 WEAK_ALONG = Column(
@@ -149,8 +151,9 @@ class Dataset:
         """Refuse what no model can learn from.
 
         Raises:
-            ModelError: fewer than 50 labelled points, labels all alike, a path of one point, or
-                labels of different identities (matcher, true pose, sensor) under one roof.
+            ModelError: fewer than 50 labelled points, labels all alike, a path of one point (`join`
+                leaves none), or labels of different identities (matcher, true pose, sensor) under
+                one roof.
         """
         if len(self) < POINTS_MIN:
             losses = "; ".join(f"{count} {reason}" for reason, count in self.losses.items())
@@ -227,8 +230,9 @@ def join(
     """Join factors and labels by place: each label gets the factors of the nearest sample point.
 
     Every label that is not joined is counted with its reason: it failed, a value is NaN, no sample
-    point within the tolerance, two sample points equally near (within 1 mm), or another scan of its
-    group nearer to that sample point.
+    point within the tolerance, two sample points equally near (within 1 mm), another scan of its
+    group nearer to that sample point, or no other labelled place on its path: the end of a side
+    street makes no path that could be held out.
 
     Args:
         factors: the factor table: place columns (`PLACE`), factors, `status` and `reason`.
@@ -251,8 +255,8 @@ def join(
     if not features:
         raise UsageError("the factor table has none of the catalogue's factors")
     joined = [_joined(places, name, labels[name], tolerance) for name in sorted(labels)]
-    table = pd.concat(joined or [_joined(places, "", _NO_LABELS, tolerance)])
-    table = _judged(table, [column.name for column in features])
+    table = pd.concat(joined or [_joined(places, "", _NO_LABELS, tolerance)], ignore_index=True)
+    table = _without_lone(_judged(table, [column.name for column in features]))
     kept = table[table["reason"] == ""]
     order = ["group", "path", "arc_length", "x", "y", "z"]
     rows = kept.drop(columns=["reason", "detail", "status"]).sort_values(order, kind="stable")
@@ -370,6 +374,14 @@ def _judged(table: pd.DataFrame, names: list[str]) -> pd.DataFrame:
             bad = (reason == "") & ~np.isfinite(table[name].to_numpy(np.float64))
             reason[bad] = f"{kind} {name} is not a number"
     return table.assign(reason=reason, detail=detail)
+
+
+def _without_lone(table: pd.DataFrame) -> pd.DataFrame:
+    """With a reason for labels whose path has no second labelled place, in no group."""
+    good = table["reason"] == ""
+    places = table[good].groupby("path")["arc_length"].nunique()
+    lone = good & table["path"].isin(places.index[places < 2])
+    return table.assign(reason=table["reason"].mask(lone, LONE))
 
 
 def _require(table: pd.DataFrame, names: Sequence[str], what: str) -> None:

@@ -70,7 +70,7 @@ def save_model(model: Model, path: str | os.PathLike[str]) -> None:
         "data_set": dict(model.data_set),
         "interval": {k: None if v != v else v for k, v in asdict(model.interval).items()},
         "threshold": model.domain.threshold,
-        "typical": {"names": model.typical.names, "units": model.typical.units},
+        "typical": {name: getattr(model.typical, name) for name in ("names", "units", "clear")},
         "worst": model.worst,
         "log": {target: forest.log for target, forest in model.forests.items()},
         "facts": dict(model.facts),
@@ -177,7 +177,7 @@ def _model(content: Mapping[str, Any], facts: Mapping[str, Any]) -> Model:
     return Model(
         forests=forests,
         domain=Domain(**arrays, threshold=float(facts["threshold"])),
-        typical=Typical(known, units, **typical),
+        typical=Typical(known, units, **typical, clear=float(facts["typical"]["clear"])),
         interval=Interval(
             float("nan") if level is None else float(level),
             float("nan") if factor is None else float(factor),

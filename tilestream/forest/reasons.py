@@ -1,5 +1,6 @@
 """Why an estimate is high, in words: what drives the trees there, and what the map is like."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,7 +15,7 @@ from tilestream.records import Column, Float64
 CLEAR = 0.15
 """Least rank correlation with the error [abs] at which a factor of the map has a bad side."""
 ERRORS = 2.0
-"""And that many standard errors: on a short drive anything goes with the error by chance."""
+"""And that many standard errors of one."""
 PIECE = 20.0
 """Points within this along a path say the same [m] (the correlation length of definitions,
 section 6)."""
@@ -177,7 +178,10 @@ class Typical:
     above: Float64
     """(f,) from the median to the upper quartile, likewise."""
     rho: Float64
-    """(f,) rank correlation with the error; 0 where it is not clear."""
+    """(f,) rank correlation with the error; 0 for a factor that is the same everywhere."""
+    clear: float
+    """From which correlation [abs] on it says on which side a factor is bad: `CLEAR`, and on a
+    short drive more, since anything goes with the error there by chance."""
 
     def out(self, values: Float64) -> Float64:
         """(n, f) how far values lie above (> 0) or below the median, 1 being the quartile on that
@@ -205,14 +209,14 @@ def typical_of(X: Float64, error: Float64, columns: Sequence[Column], pieces: in
     rho = np.zeros(len(columns))
     for k in np.flatnonzero(varies):
         rho[k] = np.corrcoef(ranks[:, k], of_error)[0, 1]
-    clear = np.abs(rho) >= max(CLEAR, ERRORS / np.sqrt(pieces))
     return Typical(
         tuple(column.name for column in columns),
         tuple(column.unit for column in columns),
         middle,
         np.where(middle > low, middle - low, deviation),
         np.where(high > middle, high - middle, deviation),
-        np.where(clear, rho, 0.0),
+        rho,
+        max(CLEAR, ERRORS / math.sqrt(pieces)),
     )
 
 
@@ -247,13 +251,13 @@ def in_words(
     1. What raises the estimate most. Where there is a virtual drive it is what that does there.
     2. What else that the trees ask for raises it most, but for the virtual drive: what a scan would
        see there.
-    3. What of the map's own factors lies farthest out on its bad side, where errors were clearly
-       larger in training, times how clearly. The trees need not ask for it.
+    3. What of the map's own factors lies farthest out, times how clearly errors go with it (those
+       with which they do not go clearly are left out). The trees need not ask for it.
 
-    A cause, 2 or 3, lies beyond the training quartile, noticeably away from the median, and sounds
-    like one. Factors that say the same (the counts are all correlated) are added up before they are
-    ranked; nothing is said twice. Each phrase comes with the factor that weighs most in it, its
-    value there and the median of the training places.
+    A cause, 2 or 3, lies beyond the training quartile, on the side that goes with larger errors and
+    noticeably away from the median, and sounds like one. Factors that say the same (the counts are
+    all correlated) are added up before they are ranked; nothing is said twice. Each phrase comes
+    with the factor that weighs most in it, its value there and the median of the training places.
 
     Args:
         contribution: (n, k) what each factor of the trees adds (`contributions`).
@@ -267,17 +271,18 @@ def in_words(
     phrases = np.array(
         [[phrase_of(name, side) for name in typical.names] for side in (False, True)]
     )
-    seen = np.abs(values - typical.middle) >= NOTICEABLE * np.abs(typical.middle)
-    reassuring = np.isin(np.where(high, phrases[1], phrases[0]), list(REASSURING))
-    cause = (np.abs(out) >= OUT) & seen & ~reassuring
     virtual, scan = (
         np.array([name.startswith(prefix) for name in typical.names]) for prefix in ("vd_", "ob_")
     )
-    bad = np.clip(typical.rho * np.clip(out, -OUT_MOST, OUT_MOST), 0.0, None)
+    seen = np.abs(values - typical.middle) >= NOTICEABLE * np.abs(typical.middle)
+    reassuring = np.isin(np.where(high, phrases[1], phrases[0]), list(REASSURING))
+    bad = typical.rho * np.clip(out, -OUT_MOST, OUT_MOST)
+    cause = (np.abs(out) >= OUT) & (bad > 0.0) & seen & ~reassuring & ~virtual
+    own = ~scan & (np.abs(typical.rho) >= typical.clear)
     steps = (
         raised,
-        np.where(cause & ~virtual, raised, 0.0),
-        np.where(cause & ~virtual & ~scan, bad, 0.0),
+        np.where(cause, raised, 0.0),
+        np.where(cause & own, bad, 0.0),
     )
     return [
         _reason(
