@@ -256,6 +256,17 @@ def test_lengths_leave_out_what_is_not_known() -> None:
     assert lengths({"floor": None}) == "none"
 
 
+def test_importances_name_their_forest(page: Path) -> None:
+    text = text_of(page, "importances")
+    used, papers = text.split("The paper's forest on 2 factors, by factor")
+    assert "The forest in use on 2 factors, by factor" in used
+    assert "vd_mean OB observability 0.750 ob_info_up" in used
+    assert "OB observability 2 2.00 cm ± 0.30 cm" in used
+    assert "bhatt_sim LS local similarity 0.600 0.23" in papers
+    assert "The paper's forest on 12 factors, by criterion, on held-out blocks" in papers
+    assert "LS local similarity 4 1.20 cm ± 0.20 cm" in papers
+
+
 def test_intervals_are_told_against_their_promise(page: Path) -> None:
     text = text_of(page, "calibration")
     assert "Promised 90 %, held 93.0 % on average, 93.0 % to 93.0 % by path." in text

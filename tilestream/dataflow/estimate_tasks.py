@@ -18,10 +18,16 @@ from tilestream.factors import catalogue, observability
 from tilestream.factors.rows import PLACE_COLUMNS
 from tilestream.factors.virtual_drive import averaged_along, physics
 from tilestream.forest.dataset import Dataset, features_of, join
-from tilestream.forest.evaluation import criterion_importances, factor_sets, importances, judge
+from tilestream.forest.evaluation import (
+    criterion_importances,
+    factor_sets,
+    importances,
+    importances_of,
+    judge,
+)
 from tilestream.forest.model_file import load_model, save_model
 from tilestream.forest.protocols import PROTOCOLS
-from tilestream.forest.training import PREDICTION_COLUMNS, Model, predict, train
+from tilestream.forest.training import MAIN, PREDICTION_COLUMNS, Model, predict, train
 from tilestream.records import Column
 from tilestream.store import hash_of
 from tilestream.tables import is_done, read_mark, read_tables, write_table
@@ -65,6 +71,7 @@ LOST_COLUMNS = (
     Column("detail", "place", "", "More of it.", "", dtype="str"),
 )
 WEIGHT_COLUMNS = (
+    Column("model", "place", "", "`used`: the model's own forest; `paper`.", "", dtype="str"),
     Column("factor", "place", "", "The factor; empty: its whole criterion.", "", dtype="str"),
     Column("criterion", "place", "", "Its criterion.", "Table IV", dtype="str"),
     Column("importance", "label", "1", "The forest's own: they sum to 1.", "impurity decrease"),
@@ -136,8 +143,11 @@ class JudgeTask(_OnDataset):
 
 @dataclass(frozen=True, kw_only=True)
 class WeighTask(_OnDataset):
-    """How much each factor and each criterion matters."""
+    """How much each factor and each criterion matters to the model, and to the paper's forest."""
 
+    model: str
+    """The model's file."""
+    needs: tuple[str, ...] = ("train-model",)
     stage: str = "weigh"
 
     @property
@@ -327,12 +337,24 @@ def _weigh(task: WeighTask) -> int:
         return 0
     dataset = _dataset(task.dataset, _dataset_identity(task.dataset))
     dataset.check()
-    own, mark = importances(dataset, seed=task.seed), {"identity": task.identity, "reason": ""}
+    model = load_model(task.model)
+    used = dataset.with_columns([c for c in dataset.columns if c.name in model.factors])
+    papers = dataset.with_columns([c for c in dataset.columns if c.factor_set == "faithful"])
+    tables = [
+        importances_of(model.forests[MAIN], used.columns).assign(model="used"),
+        importances(papers, seed=task.seed).assign(model="paper"),
+    ]
+    mark = {"identity": task.identity, "reason": ""}
     try:
-        permuted = criterion_importances(dataset, seed=task.seed)
+        permuted = [
+            criterion_importances(used, recipe=model.recipe, seed=task.seed).assign(model="used"),
+            criterion_importances(dataset, seed=task.seed).assign(model="paper"),
+        ]
     except ModelError as error:
-        permuted, mark = pd.DataFrame(), mark | {"reason": str(error)}
-    frame = pd.concat([own, permuted.assign(factor="")], ignore_index=True)
+        mark["reason"] = str(error)
+    else:
+        tables += [table.assign(factor="") for table in permuted]
+    frame = pd.concat(tables, ignore_index=True)
     write_table(task.out, frame, WEIGHT_COLUMNS, mark)
     return len(frame)
 

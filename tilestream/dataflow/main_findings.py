@@ -21,6 +21,7 @@ from tilestream.errors import ModelError
 from tilestream.forest.dataset import TARGETS, Dataset
 from tilestream.forest.evaluation import ceiling, factor_sets, figures_by_protocol
 from tilestream.forest.intervals import coverage
+from tilestream.forest.models import FORESTS
 from tilestream.forest.training import MAIN, PREDICTION_COLUMNS
 from tilestream.records import Float64
 from tilestream.report.findings import AROUND, Findings
@@ -90,29 +91,32 @@ def labels_of(
 
 
 def evaluation_of(
-    found: Mapping[tuple[str, str, str], Mapping[str, pd.DataFrame | str]], whole: str, recipe: str
+    found: Mapping[tuple[str, str, str], Mapping[str, pd.DataFrame | str]],
+    sets: Sequence[str],
+    recipe: str,
 ) -> dict[str, pd.DataFrame]:
     """Judgements as tables: `protocols`, `table_iv`, `coverage`, and `parts` for other targets.
 
     Args:
         found: what was judged (`Done.judgements`).
-        whole: what the set of all factors is called.
+        sets: the factor sets of Table IV in its order; the last has all factors.
         recipe: the model whose intervals are checked.
     """
     rows = {key: figures_by_protocol(judgement, key[1]) for key, judgement in found.items()}
     protocols = [
         table for (target, _, chosen), table in rows.items() if (target, chosen) == (MAIN, "")
     ]
-    sets = [
-        table.assign(factors=chosen or whole)
-        for (target, model, chosen), table in rows.items()
-        if target == MAIN and (chosen or model in ("paper", "default"))
+    four = [
+        rows[MAIN, model, chosen].assign(factors=name)
+        for model in FORESTS
+        for name, chosen in zip(sets, [*sets[:-1], ""], strict=True)
+        if (MAIN, model, chosen) in rows
     ]
     parts = [table.assign(target=t) for (t, _, _), table in rows.items() if t != MAIN]
     held = found.get((MAIN, recipe, ""), {}).get("path", "")
     return {
         "protocols": _joined(protocols),
-        "table_iv": _joined(sets),
+        "table_iv": _joined(four),
         "parts": _joined(parts),
         "coverage": pd.DataFrame() if isinstance(held, str) else coverage(held),
     }
@@ -149,8 +153,8 @@ def findings_of(
     labels all estimates are held out as they are.
     """
     places, found = places_of(done), done.judgements()
-    whole = "" if dataset is None else list(factor_sets(dataset.columns))[-1]
-    tables = evaluation_of(found, whole, model.recipe)
+    sets = [] if dataset is None else list(factor_sets(dataset.columns))
+    tables = evaluation_of(found, sets, model.recipe)
     held = found.get((MAIN, model.recipe, ""), {}).get("path")
     points = held if isinstance(held, pd.DataFrame) else None
     weights = [task.out for task in done.estimate if isinstance(task, WeighTask)]

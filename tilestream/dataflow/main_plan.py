@@ -391,6 +391,15 @@ def plan_estimate(
                 )
             )
             tasks += judges(join, f"{tables}/judged", settings.model, bool(observed))
+            tasks.append(
+                WeighTask(
+                    dataset=join.out,
+                    model=model,
+                    seed=seed,
+                    out=f"{tables}/judged/weights.parquet",
+                    identity=hash_of("weigh", state),
+                )
+            )
     if settings.model.use is not None:
         model, state = settings.model.use, file_hash(settings.model.use)
     if settings.model.recipe == "physics":
@@ -430,7 +439,7 @@ def judges(join: JoinTask, folder: str, model: ModelSettings, observed: bool) ->
     wanted += [(MAIN, "default", name) for name in sets if "LS" in name and "ob" not in name]
     of_parts = [model.recipe, *(name for name in known if name in PHYSICS), OPPONENT]
     wanted += [(target, name, "") for target in TARGETS if target != MAIN for name in of_parts]
-    tasks: list[Task] = [
+    return [
         JudgeTask(
             dataset=join.out,
             competitor=competitor,
@@ -444,10 +453,3 @@ def judges(join: JoinTask, folder: str, model: ModelSettings, observed: bool) ->
         )
         for target, competitor, factor_set in wanted
     ]
-    weigh = WeighTask(
-        dataset=join.out,
-        seed=seed,
-        out=f"{folder}/weights.parquet",
-        identity=hash_of(join.identity, seed, TRAIN_VERSION, VERSION),
-    )
-    return [*tasks, weigh]

@@ -9,7 +9,7 @@ from scipy.stats import spearmanr
 
 from tilestream.errors import ModelError
 from tilestream.forest.dataset import Dataset
-from tilestream.forest.models import COMPETITORS, PAPER, Recipe, grow
+from tilestream.forest.models import COMPETITORS, PAPER, Forest, Recipe, grow
 from tilestream.forest.protocols import PROTOCOLS, Split, block_splits
 from tilestream.records import Column, Float64
 
@@ -222,11 +222,15 @@ def importances(
     Returns:
         A row per factor: `factor`, `criterion`, `importance` (they sum to 1).
     """
-    forest = grow(dataset, target, recipe, seed)
+    return importances_of(grow(dataset, target, recipe, seed), dataset.columns)
+
+
+def importances_of(forest: Forest, columns: Sequence[Column]) -> pd.DataFrame:
+    """The same of a forest that has been grown on these factors."""
     return pd.DataFrame(
         {
-            "factor": dataset.names,
-            "criterion": [column.criterion for column in dataset.columns],
+            "factor": [column.name for column in columns],
+            "criterion": [column.criterion for column in columns],
             "importance": forest.trees.feature_importances_,
         }
     )

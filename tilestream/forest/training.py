@@ -1,7 +1,7 @@
 """A model for every place: train it on a dataset, apply it to a table of factors."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -100,6 +100,11 @@ class Model:
     facts: Mapping[str, Any]
     """How it was trained: recipe, seed, points, paths, targets left out and why."""
 
+    @property
+    def recipe(self) -> Recipe:
+        """How its forests were grown."""
+        return Recipe(**{part.name: self.facts[part.name] for part in fields(Recipe)})
+
 
 def train(
     dataset: Dataset, *, recipe: str = "default", seed: int = 0, n_jobs: int | None = 1
@@ -138,10 +143,7 @@ def train(
         worst=float(np.quantile(dataset.label(MAIN), WORST)),
         facts={
             "recipe": recipe,
-            "trees": grown.trees,
-            "leaf": grown.leaf,
-            "share": grown.share,
-            "log": grown.log,
+            **asdict(grown),
             "seed": seed,
             "points": len(dataset),
             "groups": sorted(set(rows["group"])),

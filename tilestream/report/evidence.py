@@ -41,6 +41,8 @@ PAPER_IMPORTANCES = {
     "score_H": 0.02, "pfh_sim_H": 0.10, "pfh_sim_mnht": 0.06, "bhatt_sim": 0.23,
 }  # fmt: skip
 """The last column of the paper's Table IV."""
+WEIGHED = {"used": "The forest in use", "paper": "The paper's forest"}
+"""Whose importances are told."""
 OURS = (*FORESTS, "physics")
 """What the claim is made for."""
 MODELS = {
@@ -79,45 +81,47 @@ LEAKS = '<span class="mark">leaks</span>'
 
 
 def importances(found: Findings) -> str:
-    """What the forest looks at."""
+    """What the forest in use looks at, and what the paper's does."""
     meaning = (
-        "How much of what the forest explains of its own training points it explains by each "
-        "factor, beside the paper's Fig. 14. The counts are all correlated and share it, so the "
-        "second table is the honest one: how much worse unseen blocks are estimated when a "
-        "criterion's factors are shuffled."
+        "How much of what a forest explains of its own training points it explains by each factor, "
+        "first of the forest that made the estimates, then of the paper's beside its Fig. 14. "
+        "Factors that say the same share it, so the tables by criterion are the honest ones: how "
+        "much worse unseen blocks are estimated when all factors of a criterion are shuffled."
     )
     parts = []
     if found.importances.empty:
         parts.append(empty("No forest was trained in this run: it has no importances."))
-    else:
-        parts.append(_of_factors(found.importances))
-    if found.criterion_importances.empty:
+    elif found.criterion_importances.empty:
         parts.append(empty("No permutation by criterion: there were no held-out blocks to judge."))
-    else:
-        parts.append(_of_criteria(found.criterion_importances))
+    for model, name in WEIGHED.items():
+        for title, table_, told in (
+            ("by factor", found.importances, _of_factors),
+            ("by criterion, on held-out blocks", found.criterion_importances, _of_criteria),
+        ):
+            part = table_[table_["model"] == model] if len(table_) else table_
+            if len(part):
+                factors = len(part) if told is _of_factors else int(part["factors"].sum())
+                parts.append(f"<h3>{name} on {factors} factors, {title}</h3>{told(part)}")
     return section("importances", "What drives the estimates", meaning, "".join(parts))
 
 
 def _of_factors(found: pd.DataFrame) -> str:
+    papers = set(found["factor"]) <= set(PAPER_IMPORTANCES)
     ranked = found.sort_values("importance", ascending=False, kind="stable")
     largest = float(ranked["importance"].max()) or 1.0
     rows = []
     for row in _records(ranked):
         name, criterion = str(row["factor"]), str(row["criterion"])
         colour = CRITERION.get(criterion, OTHER)
-        papers = PAPER_IMPORTANCES.get(name)
-        rows.append(
-            [
-                f"<code>{esc(name)}</code>",
-                _dot(colour) + f"{esc(criterion)} {NAMES.get(criterion, '')}",
-                bar(float(row["importance"]) / largest, colour),
-                f"{row['importance']:.3f}",
-                DASH if papers is None else f"{papers:.2f}",
-            ]
-        )
-    return "<h3>By factor</h3>" + table(
-        ["factor", "criterion", "", "importance", "the paper's"], rows, "bars named"
-    )
+        cells = [
+            f"<code>{esc(name)}</code>",
+            _dot(colour) + f"{esc(criterion)} {NAMES.get(criterion, '')}",
+            bar(float(row["importance"]) / largest, colour),
+            f"{row['importance']:.3f}",
+        ]
+        rows.append([*cells, f"{PAPER_IMPORTANCES[name]:.2f}"] if papers else cells)
+    head = ["factor", "criterion", "", "importance", *(["the paper's"] if papers else [])]
+    return table(head, rows, "bars named")
 
 
 def _dot(colour: str) -> str:
@@ -136,7 +140,7 @@ def _of_criteria(found: pd.DataFrame) -> str:
         for r in _records(found)
     ]
     head = ["criterion", "factors", "", "mean error grows by"]
-    return "<h3>By criterion, on held-out blocks</h3>" + table(head, rows, "bars")
+    return table(head, rows, "bars")
 
 
 def table_iv(found: Findings) -> str:

@@ -49,9 +49,10 @@ class Findings:
     table_iv: pd.DataFrame = field(default_factory=_none)
     """`evaluation.table_iv`."""
     importances: pd.DataFrame = field(default_factory=_none)
-    """`evaluation.importances`."""
+    """`evaluation.importances`, with the column `model`: `used` of the forest that made the
+    estimates, `paper` of the paper's on its own factors."""
     criterion_importances: pd.DataFrame = field(default_factory=_none)
-    """`evaluation.criterion_importances`."""
+    """`evaluation.criterion_importances`, likewise; `paper` on all factors."""
     coverage: pd.DataFrame = field(default_factory=_none)
     """`intervals.coverage`."""
     ceilings: dict[str, dict[str, float]] = field(default_factory=dict)

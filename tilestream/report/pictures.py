@@ -173,19 +173,25 @@ def _broken(along: pd.DataFrame, name: str) -> tuple[Float64, Float64]:
 
 
 def importances_figure(importances: pd.DataFrame) -> Figure:
-    """The forest's own importance of each factor, coloured by criterion (the paper's Fig. 14)."""
-    ranked = importances.sort_values("importance", kind="stable")
-    figure = Figure(figsize=(8.0, 0.24 * len(ranked) + 1.0), layout="constrained")
-    axes = figure.add_subplot()
-    colours = [CRITERION.get(str(c), OTHER) for c in ranked["criterion"]]
-    axes.barh(np.arange(len(ranked)), ranked["importance"].to_numpy(np.float64), color=colours)
-    axes.set_yticks(
-        np.arange(len(ranked)), ranked["factor"].astype(str), fontsize=8, parse_math=False
-    )
-    axes.set(xlabel="importance", ylim=(-0.6, len(ranked) - 0.4))
-    axes.grid(axis="x", alpha=0.25)
-    there = [c for c in CRITERION if c in set(ranked["criterion"].astype(str))]
-    axes.legend(handles=[Patch(color=CRITERION[c], label=c) for c in there], frameon=False)
+    """The importance of each factor to the forest in use and to the paper's (its Fig. 14), coloured
+    by criterion.
+    """
+    kinds = [(name, importances[importances["model"] == name]) for name in ("used", "paper")]
+    there = [(name, part) for name, part in kinds if len(part)]
+    most = max(len(part) for _, part in there)
+    figure = Figure(figsize=(6.5 * len(there), 0.24 * most + 1.2), layout="constrained")
+    for number, (name, part) in enumerate(there, start=1):
+        ranked = part.sort_values("importance", kind="stable")
+        axes = figure.add_subplot(1, len(there), number)
+        colours = [CRITERION.get(str(c), OTHER) for c in ranked["criterion"]]
+        rows = np.arange(len(ranked))
+        axes.barh(rows, ranked["importance"].to_numpy(np.float64), color=colours)
+        axes.set_yticks(rows, ranked["factor"].astype(str), fontsize=8, parse_math=False)
+        whose = "the forest in use" if name == "used" else "the paper's forest on its factors"
+        axes.set(xlabel=f"importance to {whose}", ylim=(-0.6, len(ranked) - 0.4))
+        axes.grid(axis="x", alpha=0.25)
+        known = [c for c in CRITERION if c in set(ranked["criterion"].astype(str))]
+        axes.legend(handles=[Patch(color=CRITERION[c], label=c) for c in known], frameon=False)
     return figure
 
 
