@@ -6,7 +6,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -24,6 +26,20 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no real recordings at {folder}: set TILESTREAM_DATA to their folder")
     return folder
+
+
+@pytest.fixture(scope="session")
+def _workers() -> Iterator[Any]:
+    # not imported above: the process that only hands tests out reads this file too, and must wait
+    with import_module("tilestream.dataflow.run").dask_client(None, 2, 10**9) as client:
+        yield client
+
+
+@pytest.fixture
+def workers(_workers: Any) -> Any:
+    """A client of two worker processes of our own, which all tests of a session share."""
+    _workers.wait_for_workers(2, timeout=60)  # a test before may have killed one
+    return _workers
 
 
 @pytest.fixture

@@ -216,7 +216,7 @@ def test_a_scheduler_elsewhere_is_reached_over_tls(
 ) -> None:
     tls, url = certificates(tmp_path), str(tmp_path / "map.zarr")
     command = ["ingest", str(pcd), "--store", url, "--tile-size", "20"]
-    with scheduler_elsewhere(1, tls) as (address, _):
+    with scheduler_elsewhere(1, tls, plain=True) as (address, _):
         assert run([*command, "--scheduler", address]) == 2
         assert "wants certificates: give --tls-ca" in capsys.readouterr().err
         assert not Path(url).exists()
@@ -230,6 +230,7 @@ def test_a_cluster_of_our_own_listens_where_it_is_told_to(
     tls, url = certificates(tmp_path), str(tmp_path / "map.zarr")
     where = ["--workers", "2", "--host", "127.0.0.2", *tls_options(tls)]
     assert run(["ingest", str(pcd), "--store", url, *where]) == 0
+    assert "Watch it at http://127.0.0.2:" in capsys.readouterr().err
     assert "listen on 127.0.0.2" in caplog.text
     assert "only certificates let them act" in caplog.text
 

@@ -149,18 +149,12 @@ def test_the_plan_makes_what_choices_share_once(
 
 @pytest.mark.slow
 def test_no_number_of_workers_shows_and_what_is_done_is_kept(
-    street: Path, route: ts.Route, found: Comparison, tmp_path: Path
+    street: Path, route: ts.Route, found: Comparison, tmp_path: Path, workers: distributed.Client
 ) -> None:
     store = ts.ingest(street, tmp_path / "map.zarr", tile_size=20.0)
     results: list[object] = []
     watch = lambda outcome, *_: results.append(outcome.result)  # noqa: E731
-    with (
-        distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
-        ) as cluster,
-        distributed.Client(cluster) as client,
-    ):
-        other = compare(store, [route], tmp_path / "out", CHOICES, client=client, **HOW)
+    other = compare(store, [route], tmp_path / "out", CHOICES, client=workers, **HOW)
     pd.testing.assert_frame_equal(other.rows, found.rows, check_exact=True)
     pd.testing.assert_frame_equal(other.cells, found.cells, check_exact=True)
     again = compare(store, [route], tmp_path / "out", CHOICES[1:], watch=watch, **HOW)

@@ -214,7 +214,7 @@ def get_json(url: str) -> dict[str, Any]:
 
 
 @pytest.fixture
-def workers() -> Iterator[distributed.Client]:
+def new_workers() -> Iterator[distributed.Client]:
     with dask_client(None, 2, 10**9) as client:
         yield client
 
@@ -226,13 +226,13 @@ WORDS = """[...document.querySelectorAll('*')].filter(e => e.shadowRoot).map(fun
         .filter(c => c.shadowRoot).map(walk).join(' ') : ''; }).join(' ')"""
 
 
-def test_a_browser_sees_tiles_change(workers: distributed.Client, tmp_path: Path) -> None:
+def test_a_browser_sees_tiles_change(new_workers: distributed.Client, tmp_path: Path) -> None:
     artefacts = Path(os.environ.get("TILESTREAM_ARTEFACTS", tmp_path))
-    url = page_url(workers)
+    url = page_url(new_workers)
     assert url is not None
     n = 6
     tasks = city(n, tmp_path, 0.15)
-    run = threading.Thread(target=execute, args=(tasks, workers, None))
+    run = threading.Thread(target=execute, args=(tasks, new_workers, None))
     with chromium_page() as page:
         run.start()
         wait_for_route(f"{url}.json")

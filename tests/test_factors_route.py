@@ -114,18 +114,17 @@ def test_sample_points_lie_a_sensor_height_above_the_ground(
 
 @pytest.mark.parametrize("tile_size", [pytest.param(10.0, marks=pytest.mark.slow), 64.0])
 def test_no_tiling_and_no_number_of_workers_shows(
-    street: Path, route: ts.Route, table: pd.DataFrame, tmp_path: Path, tile_size: float
+    street: Path,
+    route: ts.Route,
+    table: pd.DataFrame,
+    tmp_path: Path,
+    tile_size: float,
+    workers: distributed.Client,
 ) -> None:
     other = ts.ingest(street, tmp_path / "map.zarr", tile_size=tile_size)
-    with (
-        distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
-        ) as cluster,
-        distributed.Client(cluster) as client,
-    ):
-        found = ts.factors_along(
-            other, [route], tmp_path / "out", spacing=3.0, sensor=SENSOR, client=client
-        )
+    found = ts.factors_along(
+        other, [route], tmp_path / "out", spacing=3.0, sensor=SENSOR, client=workers
+    )
     pd.testing.assert_frame_equal(found, table)
 
 

@@ -181,38 +181,26 @@ def test_the_round_trip_errs_by_half_a_millimetre_at_most(
 
 
 def test_dask_workers_write_the_same_bytes(
-    clouds: list[Path], reference: ts.TileStore, tmp_path: Path
+    clouds: list[Path], reference: ts.TileStore, tmp_path: Path, workers: distributed.Client
 ) -> None:
     url = tmp_path / "map.zarr"
-    with (
-        distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
-        ) as cluster,
-        distributed.Client(cluster) as client,
-    ):
-        ts.ingest(clouds, url, tile_size=10.0, map_leaf=0.5, client=client)
+    ts.ingest(clouds, url, tile_size=10.0, map_leaf=0.5, client=workers)
     assert tree_digest(url) == tree_digest(reference.url)
 
 
 def test_a_killed_worker_is_made_up_for(
-    clouds: list[Path], reference: ts.TileStore, tmp_path: Path
+    clouds: list[Path], reference: ts.TileStore, tmp_path: Path, workers: distributed.Client
 ) -> None:
     url = tmp_path / "map.zarr"
-    with (
-        distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
-        ) as cluster,
-        distributed.Client(cluster) as client,
-    ):
-        victim = next(iter(client.run(os.getpid).values()))
-        seen: list[str] = []
+    victim = next(iter(workers.run(os.getpid).values()))
+    seen: list[str] = []
 
-        def watch(outcome: object, ended: int, total: int) -> None:
-            seen.append("")
-            if len(seen) == 8:
-                os.kill(victim, signal.SIGKILL)
+    def watch(outcome: object, ended: int, total: int) -> None:
+        seen.append("")
+        if len(seen) == 8:
+            os.kill(victim, signal.SIGKILL)
 
-        ts.ingest(clouds, url, tile_size=10.0, map_leaf=0.5, client=client, watch=watch)
+    ts.ingest(clouds, url, tile_size=10.0, map_leaf=0.5, client=workers, watch=watch)
     assert tree_digest(url) == tree_digest(reference.url)
 
 

@@ -271,15 +271,13 @@ def test_starts_split_over_tasks_give_the_same_tables(
 
 @pytest.mark.slow
 def test_dask_workers_give_the_same_tables(
-    store: ts.TileStore, drive: Path, plain: tuple[pd.DataFrame, Path], tmp_path: Path
+    store: ts.TileStore,
+    drive: Path,
+    plain: tuple[pd.DataFrame, Path],
+    tmp_path: Path,
+    workers: distributed.Client,
 ) -> None:
-    with (
-        distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
-        ) as cluster,
-        distributed.Client(cluster) as client,
-    ):
-        labels = ts.localize(store, drive, tmp_path, starts=FEW, starts_per_task=7, client=client)
+    labels = ts.localize(store, drive, tmp_path, starts=FEW, starts_per_task=7, client=workers)
     pd.testing.assert_frame_equal(labels, plain[0], check_exact=True)
     same_tables(tmp_path, plain[1])
 

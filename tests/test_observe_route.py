@@ -64,16 +64,10 @@ def test_rows_follow_the_route_and_say_what_is_observed_from_their_places(
 
 
 def test_no_tiling_and_no_number_of_workers_shows(
-    street: Path, route: ts.Route, table: pd.DataFrame, tmp_path: Path
+    street: Path, route: ts.Route, table: pd.DataFrame, tmp_path: Path, workers: distributed.Client
 ) -> None:
     other = ts.ingest(street, tmp_path / "map.zarr", tile_size=10.0)
-    with (
-        distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
-        ) as cluster,
-        distributed.Client(cluster) as client,
-    ):
-        found = observe_along(other, [route], tmp_path / "out", client=client, **HOW)
+    found = observe_along(other, [route], tmp_path / "out", client=workers, **HOW)
     pd.testing.assert_frame_equal(found, table, check_exact=True)
 
 

@@ -47,7 +47,10 @@ def test_a_moved_block_holds_the_moved_points(city: Path) -> None:
 def test_two_workers_over_tcp_write_the_bytes_of_a_serial_run(
     city: Path, serial: dict[str, str], tmp_path: Path
 ) -> None:
-    with scheduler_elsewhere(2) as (address, _), dask_client(address, None, 10**9) as client:
+    with (
+        scheduler_elsewhere(2, plain=True) as (address, _),
+        dask_client(address, None, 1) as client,
+    ):
         run_city(city, str(tmp_path), N, SIZE, client=client)
     assert len(serial) > 100
     assert digest(tmp_path) == serial

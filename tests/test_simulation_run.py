@@ -122,15 +122,9 @@ def test_a_simulation_leaves_map_logs_and_records_and_nothing_else(made: Path) -
 
 @pytest.mark.slow
 def test_two_dask_workers_write_the_same_bytes(
-    settings: SimulationSettings, made: Path, tmp_path: Path
+    settings: SimulationSettings, made: Path, tmp_path: Path, workers: distributed.Client
 ) -> None:
-    with (
-        distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
-        ) as cluster,
-        distributed.Client(cluster) as client,
-    ):
-        there = simulate(settings, tmp_path / "dask", client=client)
+    there = simulate(settings, tmp_path / "dask", client=workers)
     assert files(there) == files(made)
 
 
