@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from sklearn.ensemble import RandomForestRegressor
 
 from tilestream.errors import ModelError
+from tilestream.factors import layout
 from tilestream.forest import evaluation
-from tilestream.forest.dataset import Dataset, join
+from tilestream.forest.dataset import Dataset, join, with_derived
 from tilestream.forest.evaluation import (
     PAPER_TABLE,
     ceiling,
@@ -38,6 +39,7 @@ from tilestream.forest.models import (
     tuned,
 )
 from tilestream.forest.protocols import Split, block_splits, leave_path_out, random_split
+from tilestream.records import Column
 
 THREE = {"a": 420, "b": 420, "c": 420}
 QUICK = Recipe(trees=20)
@@ -119,8 +121,15 @@ def test_a_forest_of_logarithms_is_near_the_median() -> None:
 
 @pytest.mark.parametrize("name", sorted(COMPETITORS))
 def test_every_competitor_estimates_what_it_has_not_seen(name: str, caused: Dataset) -> None:
+    rng = np.random.default_rng(0)
+    asked = {n: rng.normal(size=len(caused)) for n in FOOTPRINT if n not in caused.names}
     seen = caused.rows[caused.names[0]].abs()  # physics asks for it
-    caused = replace(caused, rows=caused.rows.assign(vd_mean=seen))
+    robust = (Column(n, "LY", "1", "", "", "robust") for n in asked)
+    caused = replace(
+        caused,
+        rows=caused.rows.assign(vd_mean=seen, **asked),
+        columns=(*caused.columns, *robust),
+    )
     rows = np.arange(len(caused))
     split = Split("half", rows[::3], rows[1::3])
     blind = replace(caused, rows=caused.rows.copy())
@@ -148,8 +157,27 @@ def test_the_opponents_are_what_they_are_called() -> None:
     both = [Split("", np.arange(len(found)), np.arange(len(found)))]
     of_path = held_out(found, both, "path median").groupby("path")["estimate"].unique()
     assert of_path["b"] == [np.median(label[path == "b"])]
-    assert len(FOOTPRINT) == 7
-    assert set(FOOTPRINT) <= {column.name for column in COLUMNS}
+    with pytest.raises(ModelError, match="needs the robust factors empty_sector, wall_H"):
+        held_out(found, split, "footprint forest")
+
+
+def test_the_footprint_forest_asks_for_azimuths_and_horizontal_normals_alone() -> None:
+    assert len(set(FOOTPRINT)) == 7
+    rng = np.random.default_rng(1)
+    plan = {"cells": np.array([400.0]), "azimuth": rng.integers(0, 9, (1, 90))}
+    plan |= {name: rng.integers(0, 9, (1, 90)) for name in ("wall", "azimuth_standing")}
+    plan |= {f"normal_{k}": rng.uniform(50.0, 90.0, 1) for k in ("xx", "xy", "yy")}
+
+    def seven() -> dict[str, float]:
+        """With any heights, distances and tilts."""
+        rest = [f"{kind}_{a}z" for kind in ("normal", "sight") for a in "xyz"]
+        rest += ["range", "range_squared", "sight_xx", "sight_xy", "sight_yy"]
+        sums = plan | {name: rng.uniform(1.0, 400.0, 1) for name in rest}
+        sums |= {f"normal_{m}": rng.integers(0, 9, (1, m * m)) for m in (8, 16, 90)}
+        found = pd.DataFrame(layout.factors(sums)).assign(heading=0.3)
+        return dict(with_derived(found)[list(FOOTPRINT)].iloc[0])
+
+    assert seven() == seven()
 
 
 def test_figures_by_hand() -> None:

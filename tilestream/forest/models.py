@@ -27,18 +27,18 @@ LEAST = 1e-4
 """Errors below this count as this, before a logarithm [m]."""
 CM_PER_M = 100.0
 FOOTPRINT = (
-    "feature_count",
-    "D1_count",
-    "D2_count",
-    "r_average",
+    "wall_major",
+    "wall_minor",
+    "wall_balance",
+    "wall_H",
+    "weak_along",
     "angular_H",
-    "FDOP",
-    "normal_H_8",
+    "empty_sector",
 )
-"""Seven factors that a plan of footprints could give, in the manner of Wong et al. (2019): how many
-things, poles and walls stand around (counts), how far, how widely spread in distance and azimuth,
-and facing how many ways (spreads). Theirs come from building outlines; these are the nearest that a
-factor table offers, with heights in them, so the opponent is if anything stronger than theirs."""
+"""Seven factors that a plan gives, in the manner of Wong et al. (2019), who take theirs from
+building outlines: how much wall stands around, by the direction that it fixes (counts); how those
+directions and the azimuths of what stands there are spread; what they leave open. Azimuths and
+horizontal normals alone; only a high wall counts more often than a low one, a cell per storey."""
 
 
 @dataclass(frozen=True)
@@ -165,6 +165,9 @@ def _default(train: Dataset, judged: Dataset, target: str, seed: int) -> Float64
 
 def _footprint(train: Dataset, judged: Dataset, target: str, seed: int) -> Float64:
     seven = [column for column in train.columns if column.name in FOOTPRINT]
+    if len(seven) < len(FOOTPRINT):
+        absent = sorted(set(FOOTPRINT) - {column.name for column in seven})
+        raise ModelError(f"the footprint forest needs the robust factors {', '.join(absent)}")
     return _paper(train.with_columns(seven), judged.with_columns(seven), target, seed)
 
 

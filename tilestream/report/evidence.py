@@ -56,7 +56,7 @@ MODELS = {
     "training median": "the training median everywhere",
     "path median": "the median of the same path",
     "nearest training point": "the nearest training point",
-    "footprint forest": "forest on seven 2-D factors",
+    "footprint forest": "forest on seven 2-D factors: directions of walls, azimuths",
 }
 """What a competitor is, in words."""
 PROTOCOL_NAMES = {
