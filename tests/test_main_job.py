@@ -1,7 +1,10 @@
 """The main job: from map and drives to estimates; nothing done twice, nothing mixed, all told."""
 
 import hashlib
+import html
 import json
+import os
+import platform
 import re
 import shutil
 import subprocess
@@ -13,12 +16,16 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import sklearn
 import streets
 import yaml
+from chromium import TIPS, calm, chromium_page, opened, point_at
+from report_json import charts, source
 from streets import SCANS, STREETS, job
 
 import tilestream as ts
 from tilestream.cli import run as command
+from tilestream.cli.jobs import judge_over, lost_labels
 from tilestream.cli.tables import forecast_rows
 from tilestream.dataflow import estimate_tasks, main_job
 from tilestream.dataflow.calibration import calibration_file, core_hours, learn
@@ -36,14 +43,24 @@ from tilestream.dataflow.run_settings import (
     read_settings,
 )
 from tilestream.dataflow.tasks import Outcome
-from tilestream.errors import ModelError, PartialError, SourceNotFoundError, UsageError
+from tilestream.errors import (
+    LimitError,
+    ModelError,
+    PartialError,
+    SourceNotFoundError,
+    UsageError,
+)
 from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.forest import evaluation, models, training
 from tilestream.forest.dataset import TARGETS
+from tilestream.forest.intervals import coverage
 from tilestream.forest.model_file import load_model, save_model
 from tilestream.forest.models import Recipe
 from tilestream.forest.training import PREDICTION_COLUMNS
+from tilestream.report.evidence import MODELS
 from tilestream.simulation.settings import load_preset
+
+PIPELINES = Path(__file__).resolve().parents[1] / "pipelines"
 
 
 class Told:
@@ -160,6 +177,23 @@ def test_the_run_tells_what_it_did(done: tuple[Path, Told]) -> None:
     assert effective["label"]["starts"]["radius"] == 0.4
 
 
+def test_the_page_says_what_makes_the_same_figures_again(done: tuple[Path, Told]) -> None:
+    facts = json.loads((done[0] / "report" / "report.json").read_text())["facts"]
+    assert facts["python"] == platform.python_version()
+    assert facts["numpy"] == np.__version__
+    assert facts["scikit-learn"] == sklearn.__version__
+    assert facts["cores"] == os.cpu_count()
+    assert facts["wall time, all calls [s]"] > 0.0
+    model = facts["model"]
+    assert (model["from"], model["recipe"], model["trees"]) == ("trained here", "default", 4)
+    assert (model["seed"], model["points"]) == (0, len(STREETS) * SCANS)
+    effective = yaml.safe_load((done[0] / "config.yaml").read_text())
+    assert facts["settings"] | {"out": str(done[0]), "drives": effective["drives"]} == effective
+    assert list(facts["drives"]) == sorted(STREETS, key=list(STREETS).index)
+    page = (done[0] / "report" / "index.html").read_text()
+    assert '<th scope="row">label.starts.radius</th><td>0.4</td>' in page
+
+
 def test_the_evaluation_has_every_protocol_and_opponent(done: tuple[Path, Told]) -> None:
     found = json.loads((done[0] / "tables" / "evaluation.json").read_text())
     protocols = pd.DataFrame(found["protocols"])
@@ -214,9 +248,18 @@ def test_tiles_do_not_wait_for_each_other(done: tuple[Path, Told]) -> None:
 
 def test_a_second_run_redoes_nothing(inputs: Path, copy: Path) -> None:
     before, told = hashes(copy), Told()
+    cost = json.loads((copy / "run.json").read_text())
     ts.run(job(inputs, copy), watch=told)
     assert told.worked() == set()
     assert hashes(copy) == before
+    again = json.loads((copy / "run.json").read_text())
+    assert again["calls"] == cost["calls"] + 1
+    assert again["seconds_of_all_calls"] >= cost["seconds_of_all_calls"] + again["seconds"] - 0.2
+    assert set(again["stages"]) == set(cost["stages"])
+    for stage, row in cost["stages"].items():
+        assert again["stages"][stage]["core_seconds"] >= row["core_seconds"] > 0.0, stage
+    assert again["stages"]["merge"]["tasks"] == 0  # the map is there
+    assert again["stages"]["register"]["tasks"] == cost["stages"]["register"]["tasks"]
 
 
 @pytest.mark.slow
@@ -278,7 +321,7 @@ def test_a_task_that_fails_keeps_nothing_else_from_its_end(
 
     monkeypatch.setattr(estimate_tasks, "predict", failing)
     with pytest.raises(PartialError, match="cannot be estimated here"):
-        ts.run(job(inputs, copy, model={"seed": 3}))
+        ts.run(job(inputs, copy, model={"seed": 3, "recipe": "paper"}))
     told = json.loads((copy / "run.json").read_text())
     assert told["state"] == "failed"
     assert all(key.startswith("predict-") for key in told["failures"])
@@ -286,6 +329,24 @@ def test_a_task_that_fails_keeps_nothing_else_from_its_end(
     assert places.loc["tunnel", "estimate"].isna().all()
     assert places.loc["tunnel", "reason"].str.contains("task failed").all()
     assert places.loc[["canyon", "crossing"], "estimate"].notna().all()
+    the_recipe_in_use_is_judged(copy, "paper")
+
+
+def the_recipe_in_use_is_judged(folder: Path, recipe: str) -> None:
+    """Held-out lines, intervals, parts and the verdict are of the model that made the estimates."""
+    report = json.loads((folder / "report" / "report.json").read_text())
+    assert report["model"] == recipe
+    assert {row["model"] for row in report["parts"]} == {recipe, "training median"}
+    judged = pd.read_parquet(folder / "tables" / "judged" / f"error_mean-{recipe}-all.parquet")
+    judged = judged[judged["protocol"] == "path"]
+    for path in report["paths"]:
+        here = judged[judged["path"] == path["path"]]
+        assert path["mae"] == pytest.approx((here["actual"] - here["estimate"]).abs().mean())
+    expected = coverage(judged).set_index("path")["factor"]
+    factors = {row["path"]: row["factor"] for row in report["coverage"]}
+    assert factors == pytest.approx(expected.to_dict())
+    page = (folder / "report" / "index.html").read_text()
+    assert re.search(rf"The model of these estimates \([\d.]+.cm, {MODELS[recipe]}\)", page)
 
 
 def test_too_few_places_are_no_model(inputs: Path, tmp_path: Path) -> None:
@@ -408,8 +469,13 @@ def test_observability_joins_the_factors(inputs: Path, copy: Path) -> None:
     assert len(dataset) == len(STREETS) * SCANS
     assert {"vd_mean", "ob_info_along", "feature_count"} <= set(dataset.names)
     found = json.loads((copy / "tables" / "evaluation.json").read_text())
-    sets = {row["factors"] for row in found["table_iv"]}
-    assert {"observability", "all + robust", "all + robust + observability"} <= sets
+    rows = [r for r in found["table_iv"] if (r["model"], r["protocol"]) == ("paper", "path")]
+    assert [row["factors"] for row in rows] == list(evaluation.factor_sets(dataset.columns))
+    assert rows[-1]["factors"] == "all + robust + observability"
+    weights = pd.read_parquet(copy / "tables" / "judged" / "weights.parquet")
+    own = weights[weights["factor"] != ""].groupby("model")["factor"].agg(list)
+    assert own["used"] == list(load_model(copy / "model.skops").factors)
+    assert own["paper"] == [c.name for c in dataset.columns if c.factor_set == "faithful"]
     assert "physics" in {row["model"] for row in found["protocols"]}
 
 
@@ -443,6 +509,10 @@ def test_physics_without_a_virtual_drive_is_refused(inputs: Path, tmp_path: Path
 # --- The settings
 
 
+JOB = "out: run\nmap: {sources: [a.pcd]}\n"
+LEARNING = "out: run\nmap: {sources: [a.pcd]}\nroutes: [r.csv]\nsimulate: {}\n"
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -466,6 +536,17 @@ def test_physics_without_a_virtual_drive_is_refused(inputs: Path, tmp_path: Path
             "out: run\nmap: {sources: [a.pcd]}\ndrives: [{log: a.mcap}]\nsensor: VLP-16",
             r"known are VLP16",
         ),
+        (JOB + "drives: [{log: a.mcap, beam: 16}]", r"drives\.0: beam is no .*did you mean beams"),
+        (JOB + "simulate: {prset: paper}", r"simulate: prset is no .*did you mean preset"),
+        (LEARNING + "observe: {range_mx: 3}", r"observe: range_mx is no .*did you mean range_max"),
+        (LEARNING + "model: {recip: paper}", r"model: recip is no .*did you mean recipe"),
+        (LEARNING + "report: {treshold: 1}", r"report: treshold is no .*did you mean threshold"),
+        (LEARNING + "label: {matcher: {solvr: raw}}", r"matcher.*: solvr is no .*mean solver"),
+        (LEARNING + "label: {matcher: {solver: best}}", r"matcher.*: solver is 'best'.* or 'raw'"),
+        (LEARNING + "label: {matcher: fast}", r"matcher.* is 'fast'.*'default' or 'autoware'"),
+        (LEARNING + "sensor: {name: x, range_mx: 3}", r"range_mx is no .*did you mean range_max"),
+        (LEARNING + "sensor: {name: x}", r"sensor.*: range_max is .*Field required"),
+        (LEARNING + "drives: {log: a.mcap}", r"drives is .*valid tuple"),
         ("just words", r"give the fields of a job"),
         ("out: [", r"no YAML"),
     ],
@@ -509,10 +590,152 @@ def test_a_run_directory_that_is_a_file_is_named(inputs: Path, tmp_path: Path) -
             ts.run(job(inputs, out))
 
 
-def test_a_log_that_is_not_there_is_named(inputs: Path, tmp_path: Path) -> None:
-    drives = [{"log": str(tmp_path / "nowhere.mcap")}]
-    with pytest.raises(SourceNotFoundError, match=r"nowhere\.mcap"):
-        ts.run(job(inputs, tmp_path / "run", drives=drives))
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"drives": [{"log": "nowhere.mcap"}]}, r"nowhere\.mcap: no such (log|file)"),
+        ({"routes": ["nowhere.geojson"]}, r"nowhere\.geojson: no such file; check the path"),
+        ({"map": {"sources": ["nowhere.laz"]}}, r"nowhere\.laz: no such file .*check the path"),
+        ({"map": {"sources": ["nowhere_*.laz"]}}, r"nowhere_\*\.laz: the pattern matches no file"),
+        (
+            {"model": {"use": "nowhere.skops"}},
+            r"nowhere\.skops: no such model file; see model\.use",
+        ),
+    ],
+)
+def test_a_file_that_is_not_there_is_named_and_nothing_is_measured(
+    inputs: Path, tmp_path: Path, changes: dict[str, object], said: str
+) -> None:
+    told = Told()
+    with pytest.raises(SourceNotFoundError, match=said):
+        ts.run(job(inputs, tmp_path / "run", **changes), watch=told)
+    assert told.outcomes == []
+    assert not (tmp_path / "run" / "tables").exists()
+
+
+def test_a_config_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(SourceNotFoundError, match=r"job\.yaml: no such config; `tilestream templ"):
+        ts.run(tmp_path / "job.yaml")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["shinjuku", "drive", "city"])
+def test_a_pipeline_that_ships_is_a_job(name: str) -> None:
+    settings = read_settings(PIPELINES / f"{name}.yaml")
+    assert settings.out
+    assert settings.label.matcher == "autoware"
+    assert {p.stem for p in PIPELINES.glob("*.yaml")} == {"shinjuku", "drive", "city"}
+
+
+def test_the_model_of_one_pipeline_fits_the_other() -> None:
+    """The drive is estimated by the forest of the simulation, which must have been made alike."""
+    made, used = (read_settings(PIPELINES / f"{name}.yaml") for name in ("shinjuku", "drive"))
+    assert used.model.use == f"{made.out}/model.skops"
+    assert making_of(used) == making_of(made)
+
+
+# --- Routes that were drawn
+
+
+def lane(number: int, line: list[tuple[float, float]], ele: bool) -> str:
+    """A lanelet 3 m wide along a line, with its nodes and ways."""
+    nodes, ways = [], []
+    for side, shift in ((1, 1.5), (2, -1.5)):
+        names = [100 * number + 10 * side + k for k in range(len(line))]
+        for name, (x, y) in zip(names, line, strict=True):
+            height = '<tag k="ele" v="0"/>' if ele else ""
+            nodes.append(
+                f'<node id="{name}" lat="35" lon="139"><tag k="local_x" v="{x}"/>'
+                f'<tag k="local_y" v="{y + shift}"/>{height}</node>'
+            )
+        refs = "".join(f'<nd ref="{name}"/>' for name in names)
+        ways.append(f'<way id="{10 * number + side}">{refs}</way>')
+    return "".join([*nodes, *ways]) + (
+        f'<relation id="{number}"><member type="way" role="left" ref="{10 * number + 1}"/>'
+        f'<member type="way" role="right" ref="{10 * number + 2}"/>'
+        '<tag k="type" v="lanelet"/><tag k="subtype" v="road"/></relation>'
+    )
+
+
+@pytest.fixture
+def autoware(inputs: Path, tmp_path: Path) -> Path:
+    """A map directory as Autoware lays it out: three lanes, one too short, one off the map."""
+    folder = tmp_path / "map"
+    folder.mkdir()
+    for kind in STREETS:
+        shutil.copy(inputs / f"map_{kind}.pcd", folder)
+    parts = "".join(f"map_{kind}.pcd: [{x}, 0]\n" for kind, x in STREETS.items())
+    (folder / "pointcloud_map_metadata.yaml").write_text(
+        f"x_resolution: 400.0\ny_resolution: 400.0\n{parts}"
+    )
+    lanes = [
+        lane(1, [(8.0, 0.0), (30.0, 0.0)], ele=True),
+        lane(2, [(420.0, 0.0), (420.5, 0.0)], ele=True),
+        lane(3, [(430.0, 5000.0), (460.0, 5000.0)], ele=True),
+    ]
+    (folder / "lanelet2_map.osm").write_text(f"<osm>{''.join(lanes)}</osm>")
+    return folder
+
+
+def test_without_routes_all_streets_of_the_map_are_estimated(
+    autoware: Path, elsewhere: dict[str, object], inputs: Path, tmp_path: Path
+) -> None:
+    changes = elsewhere | {"map": {"sources": [str(autoware)], "tile_size": 50.0}, "routes": []}
+    settings = job(inputs, tmp_path / "run", **changes)
+    note = f"all streets of the map, 2 lanes of {autoware}/lanelet2_map.osm; 1 shorter than"
+    assert any(note in told for told in forecast(settings).notes)
+    ts.run(settings)
+    places = pd.read_parquet(tmp_path / "run" / "report" / "places.parquet").set_index("route_id")
+    assert set(places.index) == {"1", "3"}
+    assert places.loc["1", "estimate"].notna().all()
+    assert places.loc["3", "estimate"].isna().all()
+    assert places.loc["3", "reason"].str.contains("no estimate").all()
+    assert note in html.unescape((tmp_path / "run" / "report" / "index.html").read_text())
+    (autoware / "lanelet2_map.osm").unlink()
+    with pytest.raises(UsageError, match=r"no routes: give files of routes.*lanelet2_map\.osm"):
+        forecast(settings)
+
+
+def test_a_route_that_leaves_the_map_is_estimated_as_far_as_it_is_mapped(
+    elsewhere: dict[str, object], inputs: Path, tmp_path: Path
+) -> None:
+    line = {"type": "LineString", "coordinates": [[8.0, 0.0], [130.0, 0.0]]}
+    (tmp_path / "drawn.geojson").write_text(
+        json.dumps({"type": "Feature", "properties": {"route_id": "out"}, "geometry": line})
+    )
+    (tmp_path / "drawn.osm").write_text(
+        f"<osm>{lane(7, [(808.0, 0.0), (930.0, 0.0)], ele=False)}</osm>"
+    )
+    routes = [str(tmp_path / "drawn.geojson"), str(tmp_path / "drawn.osm")]
+    ts.run(job(inputs, tmp_path / "run", **(elsewhere | {"routes": routes})))
+    told = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert (told["state"], told["failures"]) == ("done", {})
+    places = pd.read_parquet(tmp_path / "run" / "report" / "places.parquet")
+    assert places.groupby("route_id").size().tolist() == [123, 123]
+    near, far = places[places["arc_length"] < 30.0], places[places["arc_length"] > 60.0]
+    assert near["estimate"].notna().all()
+    assert far["estimate"].isna().all()
+    assert far["reason"].str.contains("ground|map").all(), far["reason"].unique()
+
+
+# --- The page as a person gets it
+
+
+def test_the_page_of_a_run_answers_to_the_mouse(done: tuple[Path, Told]) -> None:
+    page = done[0] / "report" / "index.html"
+    data = source(charts(page)["city-map"], "in_domain")
+    top = len(data["arc"]) - 1
+    with chromium_page() as tab:
+        opened(tab, page)
+        assert tab.evaluate("document.documentElement.dataset.charts") == str(1 + len(STREETS))
+        point_at(tab, "city-map", "in_domain", top)
+        tip = tab.wait_for(TIPS)
+        words = [data[name][top] for name in ("shown", "interval", "fail", "axes", "starts")]
+        for told in words:
+            assert told.replace("\u00a0", " ") in tip
+        assert re.search(r"starts that fail: [\d.]+ %", tip)
+        assert re.search(r"along [\d.]+, across [\d.]+, up [\d.]+ cm", tip)
+        calm(tab)
 
 
 # --- The commands
@@ -536,6 +759,43 @@ def test_the_command_prints_the_headline_and_gates(
     assert command(["run", str(config), "--workers", "1", "--fail-over", "1e-6"]) == 1
     assert "78 of 78 sample points are estimated above 1e-06 m" in capsys.readouterr().err
     assert command(["run", str(config), "--workers", "1", "--fail-over", "99"]) == 0
+    assert "0 of 78 sample points have no estimate" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("limit", ["0", "-0.25", "nan"])
+def test_a_limit_that_cannot_be_is_refused_before_the_job(
+    config: Path, capsys: pytest.CaptureFixture[str], limit: str
+) -> None:
+    before = (Path(yaml.safe_load(config.read_text())["out"]) / "run.json").stat().st_mtime_ns
+    assert command(["run", str(config), "--fail-over", limit]) == 2
+    assert "give metres above 0" in capsys.readouterr().err
+    after = (Path(yaml.safe_load(config.read_text())["out"]) / "run.json").stat().st_mtime_ns
+    assert after == before
+
+
+def test_a_gate_does_not_open_on_places_that_nobody_estimated(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "report").mkdir()
+    estimate = [0.1] * 90 + [None] * 10
+    places = pd.DataFrame({"route_id": "a", "arc_length": range(100), "estimate": estimate})
+    places.to_parquet(tmp_path / "report" / "places.parquet")
+    with pytest.raises(LimitError, match="10 of 100 sample points have no estimate"):
+        judge_over(tmp_path, 0.25)
+    places.iloc[:92].to_parquet(tmp_path / "report" / "places.parquet")
+    judge_over(tmp_path, 0.25)
+    assert "2 of 92 sample points have no estimate" in capsys.readouterr().err
+
+
+def test_labels_that_are_lost_are_told_in_a_line(tmp_path: Path) -> None:
+    told = {"labelled": 60, "lost_labels": {"label failed": 1, "no sample point near": 20}}
+    (tmp_path / "run.json").write_text(json.dumps(told))
+    (line,) = lost_labels(tmp_path)
+    assert line == (
+        "21 of 81 measured places are not used: 20 no sample point near, 1 label failed"
+    )
+    (tmp_path / "run.json").write_text(json.dumps(told | {"lost_labels": {}}))
+    assert lost_labels(tmp_path) == []
 
 
 def test_the_plan_tells_stages_memory_and_cost(

@@ -61,7 +61,7 @@ def places_of(done: Done) -> pd.DataFrame:
         found = pd.DataFrame(columns=[*PLACE, *names])
     joined = factors.merge(found, on=PLACE, how="left", validate="one_to_one")
     lost = joined["status"].isna()
-    joined["in_domain"] = joined["in_domain"].eq(True)
+    joined["in_domain"] = joined["in_domain"].astype("boolean")
     joined.loc[lost, "status"] = "failed"
     joined.loc[lost, "reason"] = "no estimate: its task failed, see run.json"
     dtypes = {c.name: c.dtype for c in PREDICTION_COLUMNS if c.dtype == "float64"}
@@ -106,10 +106,11 @@ def evaluation_of(
     protocols = [
         table for (target, _, chosen), table in rows.items() if (target, chosen) == (MAIN, "")
     ]
+    judged_as = {name: "" if name == sets[-1] else name for name in sets}
     four = [
         rows[MAIN, model, chosen].assign(factors=name)
         for model in FORESTS
-        for name, chosen in zip(sets, [*sets[:-1], ""], strict=True)
+        for name, chosen in judged_as.items()
         if (MAIN, model, chosen) in rows
     ]
     parts = [table.assign(target=t) for (t, _, _), table in rows.items() if t != MAIN]
