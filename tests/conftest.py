@@ -18,6 +18,38 @@ settings.register_profile("calm", deadline=None, suppress_health_check=[HealthCh
 settings.load_profile("calm")
 
 
+LONG = (
+    "registration",  # these two compile most kernels, and not the same
+    "factors_against_literal",
+    "main_job",
+    "run",
+    "simulation_run",
+    "vicinity",
+    "ingest",
+    "cli",
+    "scale",
+    "dashboard",
+    "report",
+    "observe_route",
+    "forest_models",
+    "interpreted",
+    "forest_model_file",
+    "report_page",
+    "readme",
+    "store",
+    "factors_route",
+    "localize_drive",
+    "compare",
+)
+"""Files of ten seconds and more, the longest first: what is begun last must be short, or one of
+the processes that the tests run in would wait for another."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    order = {f"test_{name}.py": number for number, name in enumerate(LONG)}
+    items.sort(key=lambda item: order.get(item.path.name, len(order)))
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """The folder of real recordings; tests that ask for it are skipped where it is absent."""

@@ -108,7 +108,7 @@ def test_any_tile_and_block_size_stores_the_points_of_the_definition(
     seed: int,
 ) -> None:
     rng = np.random.default_rng(seed)
-    cloud = rng.normal(0.0, 4.0, (800, 3))
+    cloud = rng.normal(0.0, 2.0, (800, 3))
     write_pcd(tmp_path / "a.pcd", cloud[:500])
     write_pcd(tmp_path / "b.pcd", cloud[500:])
     monkeypatch.setattr(ingest_tasks, "MAX_BLOCK_POINTS", block)

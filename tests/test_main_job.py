@@ -57,6 +57,7 @@ from tilestream.forest.intervals import coverage
 from tilestream.forest.model_file import load_model, save_model
 from tilestream.forest.models import Recipe
 from tilestream.forest.training import PREDICTION_COLUMNS
+from tilestream.report import pictures
 from tilestream.report.evidence import MODELS
 from tilestream.simulation.settings import load_preset
 
@@ -81,7 +82,7 @@ class Told:
 
 @pytest.fixture(scope="module", autouse=True)
 def small_forests(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Five trees instead of a hundred: these tests are about the job, not about the forest. What
+    """Five trees instead of a hundred, coarse pictures: these tests are about the job, not about the forest. What
     they learn of costs stays here.
     """
     with pytest.MonkeyPatch.context() as patch:
@@ -91,6 +92,7 @@ def small_forests(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         patch.setattr(models, "CANDIDATES", (Recipe(trees=4, leaf=2, log=True),))
         patch.setattr(training, "PAPER", quick)
         patch.delitem(models.COMPETITORS, "mlp")  # a thousand passes over the data
+        patch.setattr(pictures.png, "__defaults__", (20,))
         patch.setattr(evaluation.importances, "__defaults__", ("error_mean", quick, 0))
         patch.setattr(evaluation.criterion_importances, "__defaults__", ("error_mean", quick, 0))
         yield
@@ -497,6 +499,8 @@ def test_physics_needs_no_drive(inputs: Path, tmp_path: Path) -> None:
     places = pd.read_parquet(tmp_path / "run" / "report" / "places.parquet")
     assert (places["estimate"] == places["vd_mean"] + 0.01).all()
     assert (places["p_fail"] == places["vd_p_fail"]).all()
+    assert places["in_domain"].isna().all()
+    assert ((places["reason"] != "") == (places["estimate"] > 0.1)).all()
     middle = places.groupby("route_id")["along"].median()
     assert middle["tunnel"] > 1.5 * middle["canyon"]  # nothing holds a scan along a tunnel
 

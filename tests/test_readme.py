@@ -61,7 +61,7 @@ def test_the_drive_block_runs(
         if arguments[0] == "localize":
             arguments += ["--spacing", "12"]
         assert run(arguments) == 0
-    assert "mean_m" in capsys.readouterr().out
+    assert "mean error" in capsys.readouterr().out
 
 
 def test_the_city_block_runs(

@@ -62,9 +62,9 @@ def test_a_halo_read_equals_a_brute_force_selection(
     tmp_path: Path, tile: float, halo: float, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    cloud = np.round(rng.uniform(-12.0, 12.0, (300, 3)), 3)
+    cloud = np.round(rng.uniform(-6.0, 6.0, (300, 3)), 3)
     made = make_store(tmp_path, cloud, tile_size=tile, halo=halo, map_leaf=0.0)
-    for key in made.keys()[:9]:
+    for key in made.keys()[::5]:
         lo = np.array(key) * tile - halo
         hi = lo + tile + 2 * halo
         inside = ((cloud[:, :2] >= lo - 1e-9) & (cloud[:, :2] < hi - 1e-9)).all(axis=1)

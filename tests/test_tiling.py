@@ -37,7 +37,7 @@ def test_every_place_lies_in_the_core_of_its_tile_and_of_no_other(
     assert list(grid.keys_over(Box(x, y, x + 1, y + 1))) == [key]
 
 
-@given(st.integers(1, 50), st.integers(0, 200), keys)
+@given(st.integers(1, 50), st.integers(0, 60), keys)
 def test_the_halo_box_touches_exactly_the_tiles_within_the_halo(
     tile: int, halo: int, key: TileKey
 ) -> None:

@@ -81,15 +81,16 @@ def finite_block(
     """The points of three columns of stored numbers, without those that are NaN or infinite."""
     points = np.empty((len(x), 3))
     scale, offset = np.array(scaling.scale), np.array(scaling.offset)
-    kept = finite_points(_native(x), _native(y), _native(z), scale, offset, points)
+    kept = finite_points(*_native(x, y, z), scale, offset, points)
     return Block(points[:kept], dropped=len(x) - kept)
 
 
-def _native(column: NDArray[Any]) -> NDArray[Any]:
-    """The column in a type that the kernel is compiled for, in this machine's byte order."""
-    if column.dtype in (np.float32, np.float64, np.int32) and column.dtype.isnative:
-        return column
-    return column.astype(np.float64)
+def _native(*columns: NDArray[Any]) -> tuple[NDArray[Any], ...]:
+    """The columns in one type, of this machine's byte order: few, as each is compiled for anew."""
+    kind, *others = {column.dtype for column in columns}
+    if not others and kind in (np.float32, np.float64, np.int32) and kind.isnative:
+        return columns
+    return tuple(column.astype(np.float64) for column in columns)
 
 
 @dataclass(frozen=True)
