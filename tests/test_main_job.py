@@ -82,8 +82,8 @@ class Told:
 
 @pytest.fixture(scope="module", autouse=True)
 def small_forests(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Five trees instead of a hundred, coarse pictures: these tests are about the job, not about the forest. What
-    they learn of costs stays here.
+    """Five trees instead of a hundred, coarse pictures: these tests are about the job. What they
+    learn of costs stays here.
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
