@@ -81,7 +81,8 @@ def finite_block(
     """The points of three columns of stored numbers, without those that are NaN or infinite."""
     points = np.empty((len(x), 3))
     scale, offset = np.array(scaling.scale), np.array(scaling.offset)
-    kept = finite_points(*_native(x, y, z), scale, offset, points)
+    x, y, z = _native(x, y, z)
+    kept = finite_points(x, y, z, scale, offset, points)
     return Block(points[:kept], dropped=len(x) - kept)
 
 
