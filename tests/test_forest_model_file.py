@@ -19,6 +19,7 @@ from scipy.stats import spearmanr
 from sklearn.linear_model import LinearRegression
 
 from tilestream.dataflow.estimate_tasks import COLUMNS as COLUMNS_LEARNT
+from tilestream.dataflow.estimate_tasks import physical
 from tilestream.errors import ModelError, SourceNotFoundError, UsageError
 from tilestream.forest import model_file, training
 from tilestream.forest.dataset import TARGETS, Dataset, features_of, join, made_with
@@ -315,6 +316,45 @@ def test_the_worst_places_name_a_cause_in_the_map() -> None:
     pd.testing.assert_frame_equal(lean.drop(columns="reason"), found.drop(columns="reason"))
     assert lean["reason"].str.contains("nothing fixes the direction of travel").sum() > 50
     assert not lean["reason"].str.contains("angular_H").any()
+
+
+def test_without_training_reasons_rest_on_fixed_bounds() -> None:
+    usual = {
+        "status": "done", "reason": "", "vd_mean": 0.06, "vd_floor": 0.02, "vd_tail": 0.04,
+        "vd_p_fail": 0.1, "vd_along": 0.05, "vd_across": 0.02, "vd_up": 0.01,
+        "ob_info_along": 9000.0, "ob_info_across": 12000.0,
+        "ob_unmapped": 0.02, "ob_ghosts": 0.1, "ob_returns": 0.8,
+    }  # fmt: skip
+    tunnel = {"vd_mean": 0.57, "vd_along": 0.55, "ob_info_along": 600.0}
+    blind = {"vd_mean": 0.2, "vd_across": 0.18, "ob_info_across": 900.0, "ob_returns": 0.3}
+    edge = {"vd_mean": 0.2, "vd_up": 0.19, "ob_unmapped": 0.25, "ob_ghosts": 0.45}
+    nothing = {"vd_mean": np.nan, "status": "missing", "reason": "nothing in view"}
+    rows = pd.DataFrame([usual | other for other in ({}, tunnel, blind, edge, nothing)])
+    found = physical(rows, 0.01)
+    told = found["reason"].str.replace("\u00a0", " ").str.split("; ").tolist()
+    assert told == [
+        [""],
+        [
+            "a virtual drive slides along the road (55 cm)",
+            "nothing fixes the direction of travel (5 % of what fixes the other)",
+        ],
+        [
+            "a virtual drive slides across the road (18 cm)",
+            "nothing fixes the direction across (10 % of what fixes the other)",
+            "few beams would come back (30 %)",
+        ],
+        [
+            "a virtual drive rises or sinks (19 cm)",
+            "much of the view is not in the map (25 %)",
+            "traffic baked into the map stands in view (45 %)",
+        ],
+        ["nothing in view"],
+    ]
+    assert found["in_domain"].isna().all()
+    assert found.loc[:3, "estimate"].tolist() == pytest.approx([0.07, 0.58, 0.21, 0.21])
+    empty = ["low", "high", "domain_distance"]
+    assert found[empty].isna().all(axis=None)
+    pd.testing.assert_frame_equal(physical(rows.iloc[[2]], 0.01), found.iloc[[2]])
 
 
 def test_every_factor_has_a_phrase_and_its_unit_words() -> None:

@@ -256,6 +256,28 @@ def test_lengths_leave_out_what_is_not_known() -> None:
     assert lengths({"floor": None}) == "none"
 
 
+def test_without_training_no_place_is_called_like_or_unlike(
+    found: Findings, tmp_path: Path
+) -> None:
+    unknown = pd.array([None] * len(found.places), dtype="boolean")
+    bare = replace(found, places=found.places.assign(in_domain=unknown))
+    write_report(bare, tmp_path, threshold=LIMIT)
+    page = tmp_path / "index.html"
+    assert "unlike the training places" not in text_of(page, "headline")
+    assert text_of(page, "worst").count("not known") >= 10
+    chart = charts(page)["city-map"]
+    dots = source(chart, "unjudged")
+    assert set(dots["domain"]) == {"not known"}
+    assert len(dots["domain"]) == found.places["estimate"].notna().sum()
+    for label in ("like the training places", "unlike the training places"):
+        assert f'"{label}"' not in json.dumps(chart)
+    told = json.loads((tmp_path / "report.json").read_text())
+    assert told["headline"]["outside_share"] is None
+    assert {segment["in_domain"] for segment in told["segments"]} == {None}
+    written = pd.read_parquet(tmp_path / "places.parquet")
+    assert written["in_domain"].isna().all()
+
+
 def test_importances_name_their_forest(page: Path) -> None:
     text = text_of(page, "importances")
     used, papers = text.split("The paper's forest on 2 factors, by factor")

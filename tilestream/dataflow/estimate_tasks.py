@@ -27,6 +27,7 @@ from tilestream.forest.evaluation import (
 )
 from tilestream.forest.model_file import load_model, save_model
 from tilestream.forest.protocols import PROTOCOLS
+from tilestream.forest.reasons import without_training
 from tilestream.forest.training import MAIN, PREDICTION_COLUMNS, Model, predict, train
 from tilestream.records import Column
 from tilestream.store import hash_of
@@ -36,11 +37,14 @@ from tilestream.version import VERSION
 
 JOIN_VERSION = 3
 """Raise it when the dataset that is joined from the same tables changes."""
-TRAIN_VERSION = 2
+TRAIN_VERSION = 3
 """Raise it when the model or the judgement that is made from the same dataset changes."""
 FOREST_BYTES = 600_000_000
 """Memory of a task that grows forests, beyond the interpreter, for some thousand places."""
 
+LARGE = 0.10
+"""Without training: an estimate above this has a reason [m] (the least error of the paper's
+Table I)."""
 MAY_BE_NAN = ("ob_cov_along", "ob_cov_across", "ob_cov_up", "ob_cov_yaw", "vd_median")
 """What observability has no number for at a place that is lost: the others tell how lost it is."""
 COLUMNS = (
@@ -406,7 +410,11 @@ def _predict(task: PredictTask) -> int:
 
 
 def physical(places: pd.DataFrame, offset: float) -> pd.DataFrame:
-    """What the virtual drive says of places, in the columns of a model's estimates."""
+    """What the virtual drive says of places, in the columns of a model's estimates.
+
+    There is no interval, and no training place to be like: `low`, `high`, `domain_distance` and
+    `in_domain` are empty. Estimates above `LARGE` have a reason.
+    """
     good = places["status"] == "done"
     error = physics(places["vd_mean"].to_numpy(), offset)
     values: dict[str, Any] = {
@@ -421,7 +429,11 @@ def physical(places: pd.DataFrame, offset: float) -> pd.DataFrame:
     blank = {c.name: np.nan for c in PREDICTION_COLUMNS if c.dtype == "float64"}
     frame = pd.DataFrame({**blank, **values}, index=places.index)
     frame.loc[~good, list(values)] = np.nan
-    words = {"in_domain": good, "status": places["status"], "reason": places["reason"]}
+    reason = places["reason"].astype(object)
+    large = good & (error > LARGE)
+    reason[large] = without_training(places[large])
+    unknown = pd.array([None] * len(places), dtype="boolean")
+    words: dict[str, Any] = {"in_domain": unknown, "status": places["status"], "reason": reason}
     return frame.assign(**words)[[column.name for column in PREDICTION_COLUMNS]]
 
 

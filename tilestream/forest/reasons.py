@@ -1,12 +1,12 @@
 """Why an estimate is high, in words: what drives the trees there, and what the map is like."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
 from scipy.stats import rankdata
 from sklearn.ensemble import RandomForestRegressor
 
@@ -142,6 +142,17 @@ PHRASES: dict[str, tuple[str, str]] = {
 """What a value below, or above, that of a typical training place says about a place."""
 
 
+AXES = {"vd_along": SLIDES_ALONG, "vd_across": SLIDES_ACROSS, "vd_up": SINKS}
+"""What it is called when a virtual drive errs most in a direction."""
+BOUNDS = (
+    ("ob_unmapped", 0.15, 1.0, UNMAPPED),
+    ("ob_ghosts", 0.4, 1.0, TRAFFIC),
+    ("ob_returns", 0.0, 0.5, UNSEEN),
+)
+"""Shares between which a place is out of the ordinary without any training: fewer than a tenth of
+the places of the simulated Shinjuku are, by each of them."""
+HALF = 0.5
+"""A direction that is fixed less than this share of the one across to it is the weak one."""
 REASSURING = frozenset({ALL_SIDES, SPANNED, DENSE, STEEP, HOLDS, FIRM, ALIKE, MAPPED, EMPTY})
 """What is no cause of an error, on whichever side the factor is bad."""
 SHARES = frozenset(
@@ -233,13 +244,13 @@ def contributions(forest: RandomForestRegressor, X: Float64) -> Float64:
         tree = estimator.tree_
         value = tree.value[:, 0, 0]
         inner = np.flatnonzero(tree.children_left >= 0)
-        child = np.concatenate([tree.children_left[inner], tree.children_right[inner]])
-        parent = np.concatenate([inner, inner])
-        change = csr_matrix(
-            (value[child] - value[parent], (child, tree.feature[parent])),
-            shape=(tree.node_count, X.shape[1]),
-        )
-        total += (tree.decision_path(X32) @ change).toarray()
+        change, factor = np.zeros(tree.node_count), np.zeros(tree.node_count, np.int64)
+        for child in (tree.children_left[inner], tree.children_right[inner]):
+            change[child], factor[child] = value[child] - value[inner], tree.feature[inner]
+        paths = tree.decision_path(X32)
+        row = np.repeat(np.arange(len(X)), np.diff(paths.indptr))
+        place = row * X.shape[1] + factor[paths.indices]
+        total += np.bincount(place, change[paths.indices], X.size).reshape(X.shape)
     return total / len(forest.estimators_)
 
 
@@ -344,3 +355,28 @@ def phrase_of(name: str, high: bool) -> str:
     """What a high or low value of a factor says about a place."""
     known = PHRASES.get(name)
     return known[high] if known else f"{'high' if high else 'low'} {name}"
+
+
+def without_training(places: pd.DataFrame) -> list[str]:
+    """Why the virtual drive errs at places where no training says what is usual: the direction in
+    which it errs most, and what lies outside fixed bounds (`BOUNDS`). Each place for itself.
+
+    Args:
+        places: observability factors, none of them NaN.
+    """
+    needed = [*AXES, "ob_info_along", "ob_info_across", *(name for name, *_ in BOUNDS)]
+    return [_of_drive(row) for row in places[needed].to_dict("records")]
+
+
+def _of_drive(place: Mapping[Hashable, float]) -> str:
+    axis = max(AXES, key=lambda name: place[name])
+    said = [f"{AXES[axis]} ({100.0 * place[axis]:.0f}\u00a0cm)"]
+    fixed = {ALONG: place["ob_info_along"], ACROSS: place["ob_info_across"]}
+    weak, strong = sorted(fixed, key=lambda phrase: fixed[phrase])
+    if fixed[weak] < HALF * fixed[strong]:
+        share = 100.0 * max(fixed[weak], 0.0) / fixed[strong]
+        said.append(f"{weak} ({share:.0f}\u00a0% of what fixes the other)")
+    for name, low, high, phrase in BOUNDS:
+        if low <= place[name] <= high:
+            said.append(f"{phrase} ({100.0 * place[name]:.0f}\u00a0%)")
+    return "; ".join(said)

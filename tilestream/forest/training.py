@@ -60,7 +60,7 @@ PREDICTION_COLUMNS = (
         "in_domain",
         "place",
         "1",
-        "Whether the place is like the training places.",
+        "Whether the place is like the training places; empty: not known, nothing was trained.",
         "distance at most the 99 % quantile of held-out blocks",
         dtype="bool",
     ),

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from tilestream.records import Float64
 from tilestream.report.colours import ACTUAL, AGAIN, HELD_OUT, MISSING, palette, scale_of
-from tilestream.report.findings import Findings, estimates
+from tilestream.report.findings import Findings, estimates, like_training
 from tilestream.report.judgement import worst_places
 from tilestream.report.summary import AXES, STARTS, held_out_along, interval_factor, with_gaps
 from tilestream.report.words import CM_PER_M, length, lengths, percent, span
@@ -48,7 +48,7 @@ def city_map(found: Findings) -> dict[str, Any]:
     """The sample points coloured by estimate, the worst on top and numbered, as an item for
     `Bokeh.embed.embed_item`.
 
-    The data sources are named `in_domain`, `outside`, `missing` and `worst`.
+    The data sources are named `in_domain`, `outside`, `unjudged`, `missing` and `worst`.
     """
     places = found.places
     estimate = estimates(places)
@@ -63,6 +63,7 @@ def city_map(found: Findings) -> dict[str, Any]:
     for kind, marker, name in (
         ("in_domain", "circle", "like the training places"),
         ("outside", "diamond", "unlike the training places"),
+        ("unjudged", "circle", "estimated without training"),
         ("missing", "x", "no estimate"),
     ):
         rows = drawn[kinds[drawn] == kind]
@@ -109,8 +110,8 @@ def _drawn(places: pd.DataFrame) -> NDArray[np.int64]:
 
 def _kinds(places: pd.DataFrame) -> NDArray[np.str_]:
     known = np.isfinite(estimates(places))
-    like = places["in_domain"].to_numpy(bool)
-    return np.where(known, np.where(like, "in_domain", "outside"), "missing")
+    names = {"yes": "in_domain", "no": "outside", "not known": "unjudged"}
+    return np.where(known, [names[like] for like in like_training(places)], "missing")
 
 
 def _origin(places: pd.DataFrame) -> Float64:
@@ -139,10 +140,7 @@ def _columns(places: pd.DataFrame, rows: NDArray[np.int64], origin: Float64) -> 
         "fail": [percent(p) for p in value["p_fail"]],
         "axes": _told(value, AXES),
         "starts": _told(value, STARTS),
-        "domain": [
-            ("yes" if like else "no") if known else "not known"
-            for like, known in zip(part["in_domain"], np.isfinite(estimate), strict=True)
-        ],
+        "domain": like_training(part).tolist(),
         "reason": part["reason"].fillna("").astype(str).tolist(),
     }
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from tilestream.errors import UsageError
 from tilestream.forest.training import PREDICTION_COLUMNS
@@ -36,7 +37,8 @@ class Findings:
     title: str
     """Headline of the page."""
     places: pd.DataFrame
-    """A row per sample point: `PLACE_COLUMNS`, `PREDICTION_COLUMNS` and the factors."""
+    """A row per sample point: `PLACE_COLUMNS`, `PREDICTION_COLUMNS` (`in_domain` may be null) and
+    the factors."""
     labels: pd.DataFrame = field(default_factory=_none)
     """A row per drive and labelled place: `Dataset.rows`, and `held_out` [m]: the estimate by a
     model that has not seen the place's path; NaN where there is none. `low` and `high` [m] where
@@ -110,3 +112,10 @@ def _in_order(table: pd.DataFrame) -> pd.DataFrame:
 def estimates(places: pd.DataFrame) -> Float64:
     """(n,) the estimates [m]; NaN where there is none."""
     return places["estimate"].to_numpy(np.float64)
+
+
+def like_training(places: pd.DataFrame) -> NDArray[np.str_]:
+    """(n,) `yes`, `no`, or `not known`: no estimate, or nothing was trained."""
+    like = places["in_domain"].astype("boolean")
+    known = like.notna().to_numpy() & np.isfinite(estimates(places))
+    return np.where(known, np.where(like.fillna(False).to_numpy(bool), "yes", "no"), "not known")

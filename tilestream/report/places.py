@@ -39,6 +39,7 @@ MOST_ROUTES = 40
 def cards(content: Mapping[str, Any]) -> list[tuple[str, str]]:
     """The figures that a map team asks for first, and what each of them is."""
     head, limit = content["headline"], length(content["threshold"], 0)
+    unlike = (percent(head["outside_share"]), "of the places unlike the training places")
     return [
         (road(head["length"]), f"of road, {count(head['places'])} sample points"),
         (length(head["median"]), "median estimated error"),
@@ -48,7 +49,7 @@ def cards(content: Mapping[str, Any]) -> list[tuple[str, str]]:
             percent(head["over_share"]),
             f"of the places over {limit}: {road(head['over_length'])} of road",
         ),
-        (percent(head["outside_share"]), "of the places unlike the training places"),
+        *([unlike] if known(head["outside_share"]) else []),
         (count(head["labelled"]), "measured errors to train on and to judge by"),
         (count(head["missing"]), f"places without an estimate ({percent(head['missing_share'])})"),
     ]
@@ -96,7 +97,7 @@ def _routes(content: Mapping[str, Any], limit: str) -> str:
             length(r["p95"]),
             length(r["max"]),
             percent(r["over_share"]),
-            percent(r["outside_share"]),
+            percent(r["outside_share"]) if known(r["outside_share"]) else DASH,
             count(r["missing"]),
         ]
         for r in _listed(content["routes"])
@@ -169,7 +170,7 @@ def worst(content: Mapping[str, Any], pictures: Mapping[int, bytes | str]) -> st
             f"<b>{length(p['estimate'])}</b>" + _parts(p),
             span(p["low"], p["high"]),
             percent(p["p_fail"]),
-            "yes" if p["in_domain"] else "no",
+            {True: "yes", False: "no"}.get(p["in_domain"], "not known"),
             esc(p["reason"] or "") or DASH,
         ]
         for number, p in enumerate(content["worst"], start=1)

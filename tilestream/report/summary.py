@@ -9,7 +9,7 @@ import pandas as pd
 from tilestream.forest.evaluation import PAPER_TABLE, figures
 from tilestream.forest.training import PREDICTION_COLUMNS
 from tilestream.records import Float64, Int64
-from tilestream.report.findings import PLACE_COLUMNS, Findings, estimates
+from tilestream.report.findings import PLACE_COLUMNS, Findings, estimates, like_training
 from tilestream.report.judgement import reaches, segments, worst_places
 from tilestream.version import VERSION
 
@@ -60,7 +60,8 @@ def headline(places: pd.DataFrame, threshold: float) -> dict[str, Any]:
     here = estimate[known]
     reach = reaches(places)
     over = known & (np.where(known, estimate, 0.0) > threshold)
-    outside = known & ~places["in_domain"].to_numpy(bool)
+    like = like_training(places)
+    outside, judged = int((like == "no").sum()), int((like != "not known").sum())
     missing = places.loc[~known, "reason"].fillna("").astype(str).replace("", "no reason given")
     counts = missing.value_counts()
     return {
@@ -74,8 +75,8 @@ def headline(places: pd.DataFrame, threshold: float) -> dict[str, Any]:
         "over": int(over.sum()),
         "over_share": float(over.sum() / here.size) if here.size else None,
         "over_length": float(reach[over].sum()),
-        "outside": int(outside.sum()),
-        "outside_share": float(outside.sum() / here.size) if here.size else None,
+        "outside": outside if judged else None,
+        "outside_share": outside / judged if judged else None,
         "missing": len(missing),
         "missing_share": len(missing) / len(places),
         "missing_by_reason": {
@@ -114,9 +115,15 @@ def segment(places: pd.DataFrame, rows: Int64) -> dict[str, Any]:
         "mean": float(part["estimate"].mean()),
         **{name: float(worst[name]) for name in (*AXES, *STARTS)},
         "p_fail": float(part["p_fail"].max()),
-        "in_domain": bool(part.loc[part["estimate"].notna(), "in_domain"].all()),
+        "in_domain": _all_like(part[part["estimate"].notna()]),
         "reason": str(worst["reason"] or ""),
     }
+
+
+def _all_like(part: pd.DataFrame) -> bool | None:
+    """Whether all these places are like the training places; None: not known."""
+    like = like_training(part)
+    return None if (like == "not known").any() else bool((like == "yes").all())
 
 
 def place(places: pd.DataFrame, row: int) -> dict[str, Any]:
