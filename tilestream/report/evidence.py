@@ -133,7 +133,7 @@ def _of_criteria(found: pd.DataFrame) -> str:
     rows = [
         [
             f"{esc(r['criterion'])} {NAMES.get(str(r['criterion']), '')}",
-            str(r["factors"]),
+            count(r["factors"]),
             bar(float(r["increase"]) / largest, CRITERION.get(str(r["criterion"]), OTHER)),
             f"{length(r['increase'], 2)} ± {length(r['spread'], 2)}",
         ]

@@ -191,7 +191,8 @@ def importances_figure(importances: pd.DataFrame) -> Figure:
         axes.set(xlabel=f"importance to {whose}", ylim=(-0.6, len(ranked) - 0.4))
         axes.grid(axis="x", alpha=0.25)
         known = [c for c in CRITERION if c in set(ranked["criterion"].astype(str))]
-        axes.legend(handles=[Patch(color=CRITERION[c], label=c) for c in known], frameon=False)
+        patches = [Patch(color=CRITERION[c], label=c) for c in known]
+        axes.legend(handles=patches, frameon=False, loc="lower right")
     return figure
 
 
