@@ -74,8 +74,16 @@ class Forest:
     """Whether its trees speak of logarithms."""
 
     def estimate(self, X: Float64) -> Float64:
-        """(n,) estimates for (n, f) factors; each row for itself, to the bit."""
-        raw = self.trees.predict(X)
+        """(n,) estimates for (n, f) factors, all finite; each row for itself, to the bit.
+
+        The trees are asked one after the other, as scikit-learn's `predict` does it with one job;
+        its own way there costs 20 ms, and the trees of a tile's places 1 ms.
+        """
+        X32 = np.ascontiguousarray(X, np.float32)
+        raw = np.zeros(len(X))
+        for tree in self.trees.estimators_:
+            raw += tree.tree_.predict(X32)[:, 0]
+        raw /= len(self.trees.estimators_)
         estimates: Float64 = np.exp(raw) if self.log else raw
         return estimates
 
