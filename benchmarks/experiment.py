@@ -1,7 +1,7 @@
 """The tables of a finished run for RESULTS.md: Table I, Table IV, protocols, ceiling, cost.
 
     tilestream run pipelines/shinjuku.yaml
-    python benchmarks/experiment.py shinjuku [--picture FILE]
+    python benchmarks/experiment.py shinjuku
 
 Everything is read from the run directory; nothing is computed anew. Lengths are centimetres.
 """
@@ -19,6 +19,8 @@ from tilestream.forest.evaluation import PAPER_TABLE
 from tilestream.forest.protocols import PROTOCOLS
 
 CM = 100.0
+FIRST = 12
+"""Factors of each forest that are listed."""
 TITLES = {protocol.name: protocol.name for protocol in PROTOCOLS} | {
     "paper": "random quarter (the paper's)",
     "path": "a path left out",
@@ -91,6 +93,29 @@ def table_protocols(evaluation: dict[str, Any], target: str = "error_mean") -> s
     return markdown(lines, ["protocol", "model", *FIGURES])
 
 
+def table_importances(run_dir: Path) -> str:
+    """How much each criterion and each factor matters, to the forest in use and to the paper's."""
+    weights = pd.read_parquet(run_dir / "tables" / "judged" / "weights.parquet")
+    criteria = weights[weights["factor"] == ""]
+    permuted = [
+        [
+            str(row["model"]),
+            str(row["criterion"]),
+            f"{row['factors']:.0f}",
+            f"{CM * row['increase']:.2f} ± {CM * row['spread']:.2f}",
+        ]
+        for _, row in criteria.iterrows()
+    ]
+    own = weights[weights["factor"] != ""].sort_values(["model", "importance"], ascending=False)
+    first = own.groupby("model", sort=False).head(FIRST)
+    shares = [
+        [str(row["model"]), str(row["factor"]), f"{row['importance']:.3f}"]
+        for _, row in first.iterrows()
+    ]
+    head = ["forest", "criterion", "factors", "permuted on held-out blocks, MAE grows by"]
+    return f"{markdown(permuted, head)}\n\n{markdown(shares, ['forest', 'factor', 'importance'])}"
+
+
 def table_cost(run: dict[str, Any]) -> str:
     """What each stage cost."""
     lines = [
@@ -110,8 +135,9 @@ def main() -> None:
     print(f"## Errors\n\n{table_one(given.run_dir)}\n")
     print(f"## Table IV\n\n{table_four(evaluation)}\n")
     print(f"## Protocols\n\n{table_protocols(evaluation)}\n")
-    for target in ("error_tail", "p_fail"):
+    for target in dict.fromkeys(row["target"] for row in evaluation["parts"]):
         print(f"## {target}\n\n{table_protocols(evaluation, target)}\n")
+    print(f"## Importances\n\n{table_importances(given.run_dir)}\n")
     coverage = pd.DataFrame(evaluation["coverage"])
     lines = [
         [
