@@ -1,5 +1,6 @@
 """Fixtures that all tests share."""
 
+import fcntl
 import os
 import socket
 import subprocess
@@ -19,10 +20,10 @@ settings.load_profile("calm")
 
 
 LONG = (
-    "registration",  # these two compile most kernels, and not the same
-    "factors_against_literal",
+    "registration",  # compiles half of the kernels
+    "run",  # compiles none meanwhile
+    "factors_against_literal",  # compiles the other half
     "main_job",
-    "run",
     "simulation_run",
     "vicinity",
     "ingest",
@@ -48,6 +49,30 @@ the processes that the tests run in would wait for another."""
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     order = {f"test_{name}.py": number for number, name in enumerate(LONG)}
     items.sort(key=lambda item: order.get(item.path.name, len(order)))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _each_kernel_is_compiled_once(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Of two processes that need a kernel at the same time, one waits for the other's cache."""
+    numba = import_module("numba.core.dispatcher")
+    compiled_alone = numba.Dispatcher.compile
+    base = tmp_path_factory.getbasetemp()
+    folder = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    held: set[str] = set()
+
+    def compiled(kernel: Any, signature: Any) -> Any:
+        name = f"{kernel.py_func.__module__}.{kernel.py_func.__qualname__}"
+        if name in held:
+            return compiled_alone(kernel, signature)
+        with numba.global_compiler_lock, (folder / f"{name}.lock").open("w") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            held.add(name)
+            try:
+                return compiled_alone(kernel, signature)
+            finally:
+                held.remove(name)
+
+    numba.Dispatcher.compile = compiled
 
 
 @pytest.fixture(scope="session")
