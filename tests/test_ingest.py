@@ -209,8 +209,8 @@ def test_a_killed_ingest_continues_to_the_same_bytes(
     clouds: list[Path], tmp_path: Path, tiles_before_the_kill: int
 ) -> None:
     whole, broken = tmp_path / "whole.zarr", tmp_path / "broken.zarr"
-    ts.ingest(clouds, whole, tile_size=4.0, map_leaf=0.1)
-    arguments = [*map(str, clouds), "--tile-size", "4", "--map-leaf", "0.1", "--store", str(broken)]
+    ts.ingest(clouds, whole, tile_size=6.0, map_leaf=0.1)
+    arguments = [*map(str, clouds), "--tile-size", "6", "--map-leaf", "0.1", "--store", str(broken)]
     process = subprocess.Popen(
         [sys.executable, "-m", "tilestream", "ingest", *arguments],
         stdout=subprocess.DEVNULL,
@@ -226,7 +226,7 @@ def test_a_killed_ingest_continues_to_the_same_bytes(
     process.wait()
     assert (broken / "fragments").exists()
     assert tree_digest(broken) != tree_digest(whole)
-    ts.ingest(clouds, broken, tile_size=4.0, map_leaf=0.1)
+    ts.ingest(clouds, broken, tile_size=6.0, map_leaf=0.1)
     assert tree_digest(broken) == tree_digest(whole)
 
 

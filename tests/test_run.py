@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -306,23 +307,6 @@ if __name__ == "__main__":
 """
 
 
-def test_a_scheduler_in_another_process_and_its_loss() -> None:
-    with (
-        scheduler_elsewhere(1, plain=True) as (address, processes),
-        dask_client(address, None, 1) as client,
-    ):
-        naps = [Nap(TileKey(i, 0)) for i in range(10)]
-        assert all(outcome.ok for outcome in execute(naps, client, None))
-
-        def kill(outcome: Outcome, ended: int, total: int) -> None:
-            if ended == 3:
-                processes[0].kill()
-
-        naps = [Nap(TileKey(i, 0), seconds=0.05) for i in range(200)]
-        with pytest.raises(TaskError, match=rf"{address} is gone: run the same command again"):
-            execute(naps, client, kill)
-
-
 def test_a_scheduler_without_workers_is_given_up() -> None:
     with (
         scheduler_elsewhere(0, plain=True) as (address, _),
@@ -332,26 +316,35 @@ def test_a_scheduler_without_workers_is_given_up() -> None:
         execute([Nap(TileKey(0, 0))], client, None, patience=1.0)
 
 
-def test_a_run_waits_for_what_a_killed_client_left_behind(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def elsewhere() -> Iterator[tuple[str, list["subprocess.Popen[bytes]"]]]:
+    """A scheduler in a process of its own, with a worker."""
+    with scheduler_elsewhere(1, plain=True) as found:
+        yield found
+
+
+def test_a_run_waits_for_what_a_killed_client_left_behind(
+    elsewhere: tuple[str, list["subprocess.Popen[bytes]"]], tmp_path: Path
+) -> None:
+    address, _ = elsewhere
     script = tmp_path / "killed.py"
     notes = tmp_path / "notes"
     notes.mkdir()
     script.write_text(KILLED.format(tests=str(Path(__file__).parent)))
-    with scheduler_elsewhere(1, plain=True) as (address, _):
-        first = subprocess.Popen([sys.executable, script, address, tmp_path / "notes"])
-        until = time.monotonic() + 60.0
-        while not list(notes.glob("nap-*")):
-            assert time.monotonic() < until
-            time.sleep(0.05)
-        first.kill()
-        first.wait()
-        began = time.time_ns()
-        with dask_client(address, None, 1) as client:
-            execute([Nap(TileKey(1, 0), notes=str(notes))], client, None)
-        (left,) = notes.glob("nap-0_0-*")
-        (right,) = notes.glob("nap-1_0-*")
-        ends = int(left.name.rsplit("-", 1)[1]) + 3 * 10**9
-        assert began < ends < int(right.name.rsplit("-", 1)[1])
+    first = subprocess.Popen([sys.executable, script, address, tmp_path / "notes"])
+    until = time.monotonic() + 60.0
+    while not list(notes.glob("nap-*")):
+        assert time.monotonic() < until
+        time.sleep(0.05)
+    first.kill()
+    first.wait()
+    began = time.time_ns()
+    with dask_client(address, None, 1) as client:
+        execute([Nap(TileKey(1, 0), notes=str(notes))], client, None)
+    (left,) = notes.glob("nap-0_0-*")
+    (right,) = notes.glob("nap-1_0-*")
+    ends = int(left.name.rsplit("-", 1)[1]) + 3 * 10**9
+    assert began < ends < int(right.name.rsplit("-", 1)[1])
 
 
 KILLED = """
@@ -367,11 +360,29 @@ with dask_client(sys.argv[1], None, 1) as client:
 """
 
 
+def test_the_loss_of_a_scheduler_is_told(
+    elsewhere: tuple[str, list["subprocess.Popen[bytes]"]],
+) -> None:
+    """The last one with this scheduler."""
+    address, processes = elsewhere
+    with dask_client(address, None, 1) as client:
+        naps = [Nap(TileKey(i, 0)) for i in range(10)]
+        assert all(outcome.ok for outcome in execute(naps, client, None))
+
+        def kill(outcome: Outcome, ended: int, total: int) -> None:
+            if ended == 3:
+                processes[0].kill()
+
+        naps = [Nap(TileKey(i, 0), seconds=0.05) for i in range(200)]
+        with pytest.raises(TaskError, match=rf"{address} is gone: run the same command again"):
+            execute(naps, client, kill)
+
+
 def test_certificates_are_passed_through(tmp_path: Path) -> None:
     tls = certificates(tmp_path)
-    with scheduler_elsewhere(1, tls, plain=True) as (address, _):
+    with scheduler_elsewhere(0, tls, plain=True) as (address, _):
         with dask_client(address, None, 1, tls=tls) as client:
-            assert execute([Nap(TileKey(0, 0))], client, None)[0].result == "0_0"
+            assert client.scheduler.address == address
         with (
             pytest.raises(UsageError, match=r"wants certificates: give --tls-ca"),
             dask_client(address, None, 1),

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import city_tiles
+import distributed
 import numpy as np
 import pandas as pd
 import pytest
@@ -45,13 +46,10 @@ def test_a_moved_block_holds_the_moved_points(city: Path) -> None:
 
 
 def test_two_workers_over_tcp_write_the_bytes_of_a_serial_run(
-    city: Path, serial: dict[str, str], tmp_path: Path
+    city: Path, serial: dict[str, str], tmp_path: Path, workers: distributed.Client
 ) -> None:
-    with (
-        scheduler_elsewhere(2, plain=True) as (address, _),
-        dask_client(address, None, 1) as client,
-    ):
-        run_city(city, str(tmp_path), N, SIZE, client=client)
+    assert all(address.startswith("tcp://") for address in workers.nthreads())
+    run_city(city, str(tmp_path), N, SIZE, client=workers)
     assert len(serial) > 100
     assert digest(tmp_path) == serial
 
