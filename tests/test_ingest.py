@@ -330,6 +330,23 @@ def test_the_good_sources_are_ingested_and_the_bad_one_leaves_nothing(tmp_path: 
     assert tree_digest(both.url) == tree_digest(fresh.url)
 
 
+def test_sources_that_all_fail_leave_the_map_as_it_was(tmp_path: Path) -> None:
+    path, url = tmp_path / "a.pcd", tmp_path / "map.zarr"
+    write_pcd(path, np.random.default_rng(5).uniform(0.0, 20.0, (1000, 3)))
+    marks = ts.ingest(path, url, tile_size=10.0).marks()
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-100])
+    with pytest.raises(PartialError, match=r"no source could be read.*\n.*a\.pcd: ") as caught:
+        ts.ingest(path, url, tile_size=10.0)
+    store = ts.open_store(str(url))
+    assert store.marks() == marks
+    assert {s["path"]: s["reason"] for s in store.sources()} == caught.value.failures
+    path.write_bytes(whole)
+    again = ts.ingest(path, url, tile_size=10.0)
+    assert again.marks() == marks
+    assert [source["reason"] for source in again.sources()] == [""]
+
+
 @pytest.mark.parametrize("place", [(2e8, 0.0, 0.0), (0.0, -2e8, 0.0), (0.0, 0.0, 2e6)])
 def test_coordinates_that_do_not_fit_the_grid_are_named(
     tmp_path: Path, place: tuple[float, float, float]

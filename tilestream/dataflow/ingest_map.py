@@ -170,7 +170,8 @@ def read_sources(
 ) -> SourcesRead:
     """The first half of `ingest`: read all sources, plan the tiles. Arguments and errors as there.
 
-    The tasks that write the tiles may then run together with those that need them.
+    Where no source could be read, what is in the store stays: a full disk takes no map away. The
+    tasks that write the tiles may then run together with those that need them.
     """
     found = _examine_all(sources, _log_options(points_topic, pose_topic, scans))
     store = _create_or_resume(str(url), _with_crs(settings, found), found)
@@ -181,6 +182,10 @@ def read_sources(
     merges = plan_merge(
         store.url, fragments, store.settings.tile_size, store.settings.map_leaf, memory
     )
+    failures = {source.path: source.reason for source in found if source.reason}
+    if failures and not merges.tasks:
+        _close(store, found, merges, [])
+        raise PartialError(f"{store.url}: no source could be read, the map is as it was:", failures)
     _drop_tiles_without_points(store, merges)
     return SourcesRead(store, found, merges)
 
