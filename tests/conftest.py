@@ -18,7 +18,6 @@ from hypothesis import HealthCheck, settings
 settings.register_profile("calm", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("calm")
 
-
 LONG = (
     "registration",  # compiles half of the kernels
     "run",  # compiles none meanwhile
@@ -62,7 +61,7 @@ def _each_kernel_is_compiled_once(tmp_path_factory: pytest.TempPathFactory) -> N
 
     def compiled(kernel: Any, signature: Any) -> Any:
         name = f"{kernel.py_func.__module__}.{kernel.py_func.__qualname__}"
-        if name in held:
+        if name in held or not name.startswith("tilestream."):  # Numba's own may call each other
             return compiled_alone(kernel, signature)
         with numba.global_compiler_lock, (folder / f"{name}.lock").open("w") as file:
             fcntl.flock(file, fcntl.LOCK_EX)
