@@ -615,6 +615,10 @@ def test_a_file_that_is_not_there_is_named_and_nothing_is_measured(
         ts.run(job(inputs, tmp_path / "run", **changes), watch=told)
     assert told.outcomes == []
     assert not (tmp_path / "run" / "tables").exists()
+    if "model" not in changes:  # a model is refused before anything is begun
+        book = json.loads((tmp_path / "run" / "run.json").read_text())
+        assert book["state"] == "stopped"
+        assert "nowhere" in book["stopped_by"]
 
 
 def test_a_config_that_is_not_there_is_named(tmp_path: Path) -> None:

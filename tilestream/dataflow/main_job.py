@@ -13,7 +13,8 @@ import platform
 import resource
 import shutil
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -95,6 +96,16 @@ class _Book:
 
         return hear
 
+    @contextmanager
+    def closed(self) -> Iterator[None]:
+        """Where the job ends early, by an error or Ctrl-C, that is written, and why."""
+        try:
+            yield
+        except BaseException as error:
+            self.facts["stopped_by"] = str(error) or type(error).__name__
+            self.write("stopped")
+            raise
+
     def write(self, state: str) -> dict[str, Any]:
         """Write `run.json`: whole, or as it was."""
         content = {
@@ -175,16 +186,18 @@ def run(
     settings = config if isinstance(config, RunSettings) else read_settings(config)
     check_model(settings)
     book = _begin(settings)
-    with report_kept(client, settings.folder / "dask-performance.html"):
-        inputs = inputs_of(settings, client, watch)
-        read = read_map(settings, inputs, client, watch)
-        measure = plan_measure(settings, inputs, read.store, read.merges.tasks, read.identities)
-        _forget_others(settings, measure)
-        measured = _measure(read, measure, client, watch, book)
-        estimate = plan_estimate(settings, read.store.grid, measure, measured)
-        _estimate(estimate, client, book.listening(estimate.tasks, watch))
-    learn(book.tasks, book.outcomes)
-    _report(settings, inputs, read, measure, estimate, book)
+    with book.closed():
+        with report_kept(client, settings.folder / "dask-performance.html"):
+            inputs = inputs_of(settings, client, watch)
+            read = read_map(settings, inputs, client, watch)
+            merges, identities = read.merges.tasks, read.identities
+            measure = plan_measure(settings, inputs, read.store, merges, identities)
+            _forget_others(settings, measure)
+            measured = _measure(read, measure, client, watch, book)
+            estimate = plan_estimate(settings, read.store.grid, measure, measured)
+            _estimate(estimate, client, book.listening(estimate.tasks, watch))
+        learn(book.tasks, book.outcomes)
+        _report(settings, inputs, read, measure, estimate, book)
     book.write("failed" if book.failures else "done")
     if book.failures:
         raise PartialError(
