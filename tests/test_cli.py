@@ -196,6 +196,17 @@ def test_an_interrupt_is_told_in_one_line(
     assert told == "stopped; the same command continues where it was"
 
 
+def test_a_full_disk_is_told_in_one_line(
+    pcd: Path, monkeypatch: pytest.MonkeyPatch, capsys: Told
+) -> None:
+    def full(_: str) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("tilestream.cli.maps.describe", full)
+    told = "error: [Errno 28] No space left on device: make room; the same command continues"
+    assert fails(["info", str(pcd)], 1, capsys) == f"{told} where it was"
+
+
 def test_amounts_of_memory() -> None:
     assert parse_bytes("512MB") == 512_000_000
     assert parse_bytes(" 1.5 gb ") == 1_500_000_000

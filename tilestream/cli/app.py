@@ -4,6 +4,7 @@ Exit codes: 0 all good; 1 some sources, tiles or scans failed and are listed, th
 2 usage, or a job that does not fit its memory or disk; 130 Ctrl-C.
 """
 
+import errno
 import logging
 import sys
 from importlib import import_module
@@ -25,6 +26,7 @@ from tilestream.version import VERSION
 
 INTERRUPTED = 130
 """Exit code of a command that was stopped with Ctrl-C."""
+MAKE_ROOM = ": make room; the same command continues where it was"
 MARKUP: Any = "markdown"  # the other mode takes [m] for a style
 COMMANDS = {
     "ingest": ("maps", "Make a tile store from point clouds, map directories and logs of drives."),
@@ -133,5 +135,6 @@ def run(arguments: list[str]) -> int:
 def _report(error: Exception, debug: bool, code: int) -> int:
     if debug:
         err.print_exception()
-    say(f"error: {error}", to=err)
+    full = isinstance(error, OSError) and error.errno == errno.ENOSPC
+    say(f"error: {error}{MAKE_ROOM if full else ''}", to=err)
     return code
