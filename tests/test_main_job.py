@@ -497,6 +497,8 @@ def test_physics_needs_no_drive(inputs: Path, tmp_path: Path) -> None:
     ts.run(settings, watch=told)
     assert not {o.stage for o in told.outcomes} & {"register", "join", "train", "judge"}
     places = pd.read_parquet(tmp_path / "run" / "report" / "places.parquet")
+    tiles = list((tmp_path / "run" / "tables" / "predictions").glob("*.parquet"))
+    assert len(tiles) == 4  # the routes weave over y = 0: neighbours lie in another tile
     assert (places["estimate"] == places["vd_mean"] + 0.01).all()
     assert (places["p_fail"] == places["vd_p_fail"]).all()
     assert places["in_domain"].isna().all()
@@ -619,6 +621,12 @@ def test_a_file_that_is_not_there_is_named_and_nothing_is_measured(
         book = json.loads((tmp_path / "run" / "run.json").read_text())
         assert book["state"] == "stopped"
         assert "nowhere" in book["stopped_by"]
+
+
+def test_where_run_json_cannot_be_written_the_reason_is_told_all_the_same(tmp_path: Path) -> None:
+    book = main_job._Book(tmp_path / "gone")
+    with pytest.raises(ValueError, match="why it ended"), book.closed():
+        raise ValueError("why it ended")
 
 
 def test_a_config_that_is_not_there_is_named(tmp_path: Path) -> None:

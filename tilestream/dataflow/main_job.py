@@ -14,7 +14,7 @@ import resource
 import shutil
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -103,7 +103,8 @@ class _Book:
             yield
         except BaseException as error:
             self.facts["stopped_by"] = str(error) or type(error).__name__
-            self.write("stopped")
+            with suppress(OSError):  # on a full disk the reason itself matters more
+                self.write("stopped")
             raise
 
     def write(self, state: str) -> dict[str, Any]:
