@@ -235,6 +235,10 @@ def test_a_symptom_is_followed_by_causes_in_the_map() -> None:
         np.array([[0.5, 0.1]]), reassuring.names, np.array([[0.8, 0.0]]), reassuring
     )
     assert words == "a virtual drive does not hold its place (80\u00a0cm, typically 5\u00a0cm)"
+    well = usual(["vd_mean", "ob_info_up"], [0.05, 9000.0], [0.8, -0.4])
+    (words,) = in_words(np.array([[0.1, 0.5]]), well.names, np.array([[0.06, 99e3]]), well)
+    assert words == "a virtual drive does not hold its place (6\u00a0cm, typically 5\u00a0cm)"
+    assert in_words(np.array([[0.1, 0.5]]), well.names, np.array([[0.04, 99e3]]), well) == [""]
 
 
 @pytest.mark.parametrize(
@@ -329,7 +333,8 @@ def test_without_training_reasons_rest_on_fixed_bounds() -> None:
     blind = {"vd_mean": 0.2, "vd_across": 0.18, "ob_info_across": 900.0, "ob_returns": 0.3}
     edge = {"vd_mean": 0.2, "vd_up": 0.19, "ob_unmapped": 0.25, "ob_ghosts": 0.45}
     nothing = {"vd_mean": np.nan, "status": "missing", "reason": "nothing in view"}
-    rows = pd.DataFrame([usual | other for other in ({}, tunnel, blind, edge, nothing)])
+    loose = {"vd_mean": 0.3, "ob_info_along": -5.0, "ob_info_across": 0.0}  # H has no maximum
+    rows = pd.DataFrame([usual | other for other in ({}, tunnel, blind, edge, nothing, loose)])
     found = physical(rows, 0.01)
     told = found["reason"].str.replace("\u00a0", " ").str.split("; ").tolist()
     assert told == [
@@ -349,6 +354,7 @@ def test_without_training_reasons_rest_on_fixed_bounds() -> None:
             "traffic baked into the map stands in view (45 %)",
         ],
         ["nothing in view"],
+        ["a virtual drive slides along the road (5 cm)"],
     ]
     assert found["in_domain"].isna().all()
     assert found.loc[:3, "estimate"].tolist() == pytest.approx([0.07, 0.58, 0.21, 0.21])

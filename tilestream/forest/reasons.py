@@ -154,7 +154,7 @@ the places of the simulated Shinjuku are, by each of them."""
 HALF = 0.5
 """A direction that is fixed less than this share of the one across to it is the weak one."""
 REASSURING = frozenset({ALL_SIDES, SPANNED, DENSE, STEEP, HOLDS, FIRM, ALIKE, MAPPED, EMPTY})
-"""What is no cause of an error, on whichever side the factor is bad."""
+"""What explains no error, on whichever side the factor is bad."""
 SHARES = frozenset(
     {
         *(f"D{d}_{kind}" for d in (1, 2, 3) for kind in ("ratio", "share")),
@@ -257,9 +257,10 @@ def contributions(forest: RandomForestRegressor, X: Float64) -> Float64:
 def in_words(
     contribution: Float64, names: Sequence[str], values: Float64, typical: Typical
 ) -> list[str]:
-    """Why each estimate is high: a symptom, then causes; "" where nothing raises it.
+    """Why each estimate is high: a symptom, then causes; "" where nothing that raises it says why.
 
-    1. What raises the estimate most. Where there is a virtual drive it is what that does there.
+    1. What raises the estimate most and does not sound reassuring (`REASSURING`). Where there is a
+       virtual drive it is what that does there.
     2. What else that the trees ask for raises it most, but for the virtual drive: what a scan would
        see there.
     3. What of the map's own factors lies farthest out, times how clearly errors go with it (those
@@ -291,7 +292,7 @@ def in_words(
     cause = (np.abs(out) >= OUT) & (bad > 0.0) & seen & ~reassuring & ~virtual
     own = ~scan & (np.abs(typical.rho) >= typical.clear)
     steps = (
-        raised,
+        np.where(reassuring, 0.0, raised),
         np.where(cause, raised, 0.0),
         np.where(cause & own, bad, 0.0),
     )
@@ -373,7 +374,7 @@ def _of_drive(place: Mapping[Hashable, float]) -> str:
     said = [f"{AXES[axis]} ({100.0 * place[axis]:.0f}\u00a0cm)"]
     fixed = {ALONG: place["ob_info_along"], ACROSS: place["ob_info_across"]}
     weak, strong = sorted(fixed, key=lambda phrase: fixed[phrase])
-    if fixed[weak] < HALF * fixed[strong]:
+    if fixed[strong] > 0.0 and fixed[weak] < HALF * fixed[strong]:
         share = 100.0 * max(fixed[weak], 0.0) / fixed[strong]
         said.append(f"{weak} ({share:.0f}\u00a0% of what fixes the other)")
     for name, low, high, phrase in BOUNDS:
