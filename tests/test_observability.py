@@ -250,7 +250,7 @@ def test_company_does_not_show_in_an_average(cut: float, failed: list[int]) -> N
     whole = averaged_along(table)
     part = table[table["arc_length"] <= cut + 2.0 + 1e-6]
     mine = part.index[part["arc_length"] <= cut]
-    pd.testing.assert_frame_equal(averaged_along(part).loc[mine], whole.loc[mine])
+    pd.testing.assert_frame_equal(averaged_along(part).loc[mine], whole.loc[mine], check_exact=True)
 
 
 def test_places_far_apart_stand_for_themselves() -> None:

@@ -92,7 +92,7 @@ class Model:
     factors: tuple[str, ...]
     """The features, in order."""
     made_with: Mapping[str, Any]
-    """Sensor, cell size and units of the factors (`dataset.made_with`)."""
+    """What the factors were computed with: sensor, cell size, units, … (`check_making`)."""
     data_set: Mapping[str, Any]
     """Identity of the labels: matcher, starts, true pose, cell size, sensor."""
     worst: float

@@ -100,7 +100,8 @@ def routes(places: pd.DataFrame, threshold: float) -> list[dict[str, Any]]:
 
 def segment(places: pd.DataFrame, rows: Int64) -> dict[str, Any]:
     """A stretch of road over the threshold: where, how long, how bad. `worst`, the parts of the
-    error and the reason are those of its worst place, `mean` is over all its places.
+    error and the reason are those of its worst place, `mean` is over all of it that has an
+    estimate.
     """
     part = places.iloc[rows]
     worst = part.iloc[int(np.nanargmax(estimates(part)))]
