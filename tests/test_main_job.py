@@ -30,7 +30,15 @@ from tilestream.cli.tables import forecast_rows
 from tilestream.dataflow import estimate_tasks, main_job
 from tilestream.dataflow.calibration import calibration_file, core_hours, learn
 from tilestream.dataflow.main_forecast import forecast
-from tilestream.dataflow.main_plan import check_model, making_of
+from tilestream.dataflow.main_plan import (
+    check_model,
+    inputs_of,
+    making_of,
+    plan_estimate,
+    plan_measure,
+    read_map,
+)
+from tilestream.dataflow.plan import Task
 from tilestream.dataflow.run import dask_client
 from tilestream.dataflow.run_settings import (
     DriveSettings,
@@ -481,6 +489,33 @@ def test_observability_joins_the_factors(inputs: Path, copy: Path) -> None:
     assert "physics" in {row["model"] for row in found["protocols"]}
 
 
+def test_nothing_is_learnt_or_estimated_without_the_virtual_drive_that_was_asked_for(
+    inputs: Path, tmp_path: Path
+) -> None:
+    settings = job(inputs, tmp_path / "run", observe={"range_max": 14.0})
+    found = inputs_of(settings, None, None)
+    read = read_map(settings, found, None, None)
+    measure = plan_measure(settings, found, read.store, read.merges.tasks, read.identities)
+    observe = [task.key for task in measure.tasks if task.stage == "observe"]
+
+    def planned(lost: list[str]) -> dict[str, list[Task]]:
+        outcomes = [
+            Outcome(task.key, task.stage, None, "lost" if task.key in lost else "")
+            for task in measure.tasks
+        ]
+        stages: dict[str, list[Task]] = {}
+        for task in plan_estimate(settings, read.store.grid, measure, outcomes).tasks:
+            stages.setdefault(task.stage, []).append(task)
+        return stages
+
+    tiles = [key.removeprefix("observe-") for key in observe]
+    assert [str(task.tile) for task in planned([])["predict"]] == tiles
+    some = planned(observe[:1])
+    assert [str(task.tile) for task in some["predict"]] == tiles[1:]
+    assert len(some["join"][0].factors) == len(some["join"][0].observed) == len(tiles) - 1
+    assert planned(observe) == {}
+
+
 def test_physics_needs_no_drive(inputs: Path, tmp_path: Path) -> None:
     routes = [str(inputs / "canyon.mcap"), str(inputs / "tunnel.mcap")]
     model = {"recipe": "physics", "offset": 0.01}
@@ -700,6 +735,8 @@ def test_without_routes_all_streets_of_the_map_are_estimated(
     settings = job(inputs, tmp_path / "run", **changes)
     note = f"all streets of the map, 2 lanes of {autoware}/lanelet2_map.osm; 1 shorter than"
     assert any(note in told for told in forecast(settings).notes)
+    with pytest.raises(UsageError, match=r"all 3 lanes of .* shorter than the spacing, 50 m"):
+        forecast(settings.model_copy(update={"spacing": 50.0}))
     ts.run(settings)
     places = pd.read_parquet(tmp_path / "run" / "report" / "places.parquet").set_index("route_id")
     assert set(places.index) == {"1", "3"}

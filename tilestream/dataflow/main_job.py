@@ -2,7 +2,7 @@
 
 ```
 simulate? -> read sources -> merge, cells, terms, factors, register, label     (measure)
-          -> join -> judge, weigh, train -> predict                            (estimate)
+          -> join -> judge, train -> weigh, predict                            (estimate)
           -> report
 ```
 """

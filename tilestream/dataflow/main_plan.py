@@ -147,7 +147,7 @@ def _all_streets(settings: RunSettings) -> tuple[tuple[Route, ...], tuple[str, .
     """The lanes of the map directories among the sources, and what is to be told of them.
 
     Raises:
-        UsageError: there are none.
+        UsageError: there are none, or none as long as the spacing.
     """
     found = [Path(name) for source in settings.map.sources for name in sorted(glob(source))]  # noqa: PTH207
     files = [str(place / LANES) for place in found if (place / LANES).is_file()]
@@ -158,6 +158,11 @@ def _all_streets(settings: RunSettings) -> tuple[tuple[Route, ...], tuple[str, .
         )
     lanes = _routes(files, settings)
     long = tuple(lane for lane in lanes if lane.arc_length[-1] >= settings.spacing)
+    if not long:
+        raise UsageError(
+            f"{settings.out}: no routes: all {len(lanes)} lanes of {', '.join(files)} are shorter "
+            f"than the spacing, {settings.spacing:g} m"
+        )
     told = f"no routes were given: all streets of the map, {len(long)} lanes of {', '.join(files)}"
     short = len(lanes) - len(long)
     return long, (told + (f"; {short} shorter than the spacing are left out" if short else ""),)
@@ -347,12 +352,15 @@ def plan_estimate(
     """Join, judge, train, predict: from what was measured.
 
     What failed is left out here and listed by the run, so that a tile that cannot be read does not
-    keep the rest of the city from its estimates.
+    keep the rest of the city from its estimates. A tile whose virtual drive failed is left out too:
+    nothing is learnt or estimated without it where it was asked for.
     """
     done = {outcome.key for outcome in outcomes if outcome.ok}
     factors = [t for t in measure.tasks if isinstance(t, FactorsTask) and t.key in done]
     labels = [t for t in measure.tasks if isinstance(t, LabelTask) and t.key in done]
     observed = {t.tile: t for t in measure.tasks if isinstance(t, ObserveTask) and t.key in done}
+    if settings.observe is not None:
+        factors = [task for task in factors if task.tile in observed]
     making = making_of(settings)
     tables, tasks = f"{settings.out}/tables", list[Task]()
     model, state = str(settings.folder / "model.skops"), ""
