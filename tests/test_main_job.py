@@ -365,8 +365,14 @@ def test_too_few_places_are_no_model(inputs: Path, tmp_path: Path) -> None:
         ts.run(job(inputs, tmp_path / "run", drives=drives))
     told = json.loads((tmp_path / "run" / "run.json").read_text())
     assert "train-model" in told["failures"]
-    page = (tmp_path / "run" / "report" / "index.html").read_text()
+    page = html.unescape((tmp_path / "run" / "report" / "index.html").read_text())
     assert "no estimate" in page
+    # What was measured is shown all the same.
+    assert "26 labels of one drive" in page
+    assert "no model was trained without this path, so there is no estimate to show" in page
+    report = json.loads((tmp_path / "run" / "report" / "report.json").read_text())
+    assert report["headline"]["labelled"] == 26
+    assert (report["paths"][0]["judged"], report["paths"][0]["mae"]) == (0, None)
 
 
 # --- A model that is there

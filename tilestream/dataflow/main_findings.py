@@ -29,6 +29,11 @@ from tilestream.store import POINTS, Tile, TileStore
 from tilestream.tables import read_tables
 
 PLACE = ["route_id", "sample"]
+_NO_POINTS = pd.DataFrame(
+    {"path": pd.Series(dtype=str)}
+    | {name: pd.Series(dtype=np.float64) for name in ("arc_length", "estimate")}
+)
+"""Where nothing could be held out."""
 
 
 @dataclass(frozen=True)
@@ -150,14 +155,15 @@ def findings_of(
 ) -> tuple[Findings, dict[str, Any]]:
     """All that the report tells, and the figures of the evaluation for machines.
 
-    Held-out estimates are those of the model's own recipe; of a model that was not trained on these
-    labels all estimates are held out as they are.
+    Held-out estimates are those of the model's own recipe, and there are none where no path could
+    be left out; of a model that was not trained on these labels all estimates are held out as they
+    are.
     """
     places, found = places_of(done), done.judgements()
     sets = [] if dataset is None else list(factor_sets(dataset.columns))
     tables = evaluation_of(found, sets, model.recipe)
     held = found.get((MAIN, model.recipe, ""), {}).get("path")
-    points = held if isinstance(held, pd.DataFrame) else None
+    points = held if isinstance(held, pd.DataFrame) else _NO_POINTS
     weights = [task.out for task in done.estimate if isinstance(task, WeighTask)]
     weighed = read_tables(weights) if weights else pd.DataFrame({"factor": []})
     ceiling_of = ceilings(dataset, TARGETS)
@@ -165,9 +171,7 @@ def findings_of(
     gathered = Findings(
         title=title,
         places=places,
-        labels=pd.DataFrame()
-        if trained_here and points is None
-        else labels_of(dataset, places, points if trained_here else None),
+        labels=labels_of(dataset, places, points if trained_here else None),
         protocols=tables["protocols"],
         table_iv=tables["table_iv"],
         importances=weighed[weighed["factor"] != ""].reset_index(drop=True),
