@@ -151,8 +151,7 @@ def table_iv(found: Findings) -> str:
         f"{LEAKS} are comparable with them and prove nothing; the others do."
     )
     if found.table_iv.empty:
-        why = "There were no labels to judge estimates with; the paper's own figures stand alone."
-        body = empty(why)
+        body = empty(f"{_not_judged(found)} The paper's own figures stand alone.")
     else:
         body = ""
     head = ["factors", *FIGURES]
@@ -169,6 +168,16 @@ def table_iv(found: Findings) -> str:
     return section("table-iv", "Table IV", meaning, body + grouped_table(head, groups, "figures"))
 
 
+def _not_judged(found: Findings) -> str:
+    """Why nothing was judged."""
+    if found.labels.empty:
+        return "There were no labels, so nothing was judged: the estimates rest on the model."
+    return (
+        "Nothing was trained on the labels of this run, so no models were judged against each "
+        "other; the estimates stand beside what was measured."
+    )
+
+
 def _factors(row: Mapping[str, Any], several: bool) -> str:
     """The factor set, and the model where there are several."""
     return esc(row["factors"]) + (f", {_model(row['model'])}" if several else "")
@@ -182,8 +191,9 @@ def protocols(found: Findings) -> str:
         "over the same places estimates the first."
     )
     if found.protocols.empty:
-        why = "There were no labels, so nothing can be judged: the estimates rest on the model."
-        return section("protocols", "How good the estimates are", meaning, empty(why))
+        return section(
+            "protocols", "How good the estimates are", meaning, empty(_not_judged(found))
+        )
     parts = [_protocol(name, rows, found.model) for name, rows in _by_protocol(found.protocols)]
     if "error_mean" not in found.ceilings:
         parts.append(empty("No place was driven twice in this run, so no ceiling is known."))
@@ -318,7 +328,7 @@ def calibration(found: Findings) -> str:
         "the line what was promised."
     )
     if found.coverage.empty:
-        why = "Without labels on several paths no interval can be checked."
+        why = "No interval was checked: that takes a model trained here, on several paths."
         return section("calibration", "Do the intervals hold", meaning, empty(why))
     rows = [
         [
