@@ -86,13 +86,17 @@ def test_what_is_empty_says_why(others: dict[str, Path]) -> None:
         ("worst", "made without the map"),
         ("paths", "No place was labelled"),
         ("importances", "No forest was trained"),
-        ("table-iv", "no labels to judge"),
-        ("calibration", "no interval can be checked"),
+        ("table-iv", "no labels, so nothing can be judged"),
+        ("calibration", "No interval was checked"),
         ("protocols", "nothing can be judged"),
     ):
         assert why in text_of(bare, section), section
     assert "No place has an estimate" in text_of(others["nothing_estimated"], "worst")
     assert "no map here 80" in text_of(others["nothing_estimated"], "headline")
+    elsewhere = replace(whole(), protocols=pd.DataFrame(), table_iv=pd.DataFrame(), model="")
+    for told in (protocols(elsewhere), table_iv(elsewhere)):
+        assert "Nothing was trained on the labels of this run" in told
+        assert "no labels" not in told
 
 
 def test_the_headline_is_in_figures_that_a_person_reads(found: Findings, page: Path) -> None:

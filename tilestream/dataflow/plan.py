@@ -8,7 +8,9 @@ from tilestream.errors import PlanError
 
 BASE_BYTES = 350_000_000
 """Memory of a worker process before its first task: Python, NumPy, Numba, Zarr, Dask (measured
-by benchmarks/ingest.py)."""
+by benchmarks/ingest.py). One that compiles kernels, in the first run after installation, holds some
+300 MB more for as long as it lives, which no task promises: a local worker may take twice as much
+as its task."""
 DEFAULT_MEMORY = 1_500_000_000
 """What a task may use where the user promises nothing else [bytes]."""
 

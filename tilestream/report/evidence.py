@@ -171,7 +171,7 @@ def table_iv(found: Findings) -> str:
 def _not_judged(found: Findings) -> str:
     """Why nothing was judged."""
     if found.labels.empty:
-        return "There were no labels, so nothing was judged: the estimates rest on the model."
+        return "There were no labels, so nothing can be judged: the estimates rest on the model."
     return (
         "Nothing was trained on the labels of this run, so no models were judged against each "
         "other; the estimates stand beside what was measured."
