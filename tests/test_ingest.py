@@ -201,6 +201,7 @@ def test_a_killed_worker_is_made_up_for(
             os.kill(victim, signal.SIGKILL)
 
     ts.ingest(clouds, url, tile_size=10.0, map_leaf=0.5, client=workers, watch=watch)
+    assert len(seen) >= 8  # the worker was killed
     assert tree_digest(url) == tree_digest(reference.url)
 
 

@@ -45,7 +45,7 @@ def calibrate(
 
     The level is an estimate: right on average over blocks, while single blocks hold more or less.
     What holds for any blocks whatever (hierarchical conformal prediction: Lee, Barber and Willett
-    2023) puts the unknown block at infinity, and holds 96 to 99 % where 90 % are promised, since a
+    2023) puts the unknown block at infinity, and holds 95 to 99 % where 90 % are promised, since a
     drive has few blocks.
 
     Args:
