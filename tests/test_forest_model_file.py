@@ -26,16 +26,14 @@ from tilestream.forest.dataset import TARGETS, Dataset, features_of, join, made_
 from tilestream.forest.domain import domain_of
 from tilestream.forest.model_file import load_model, save_model
 from tilestream.forest.models import Recipe, grow
+from tilestream.forest.phrases import PHRASES, REASSURING, phrase_of
 from tilestream.forest.reasons import (
-    PHRASES,
-    REASSURING,
     SHARES,
     UNITS,
     Typical,
     compared,
     contributions,
     in_words,
-    phrase_of,
     typical_of,
 )
 from tilestream.forest.training import PREDICTION_COLUMNS, Model, predict, train
