@@ -184,7 +184,7 @@ def test_a_worker_is_one_thread_with_a_limit(workers: distributed.Client) -> Non
     assert list(found.values()) == [["1"] * 4] * 2
     assert list(workers.nthreads().values()) == [1, 1]
     limits = [w["memory_limit"] for w in workers.scheduler_info()["workers"].values()]
-    assert limits == [2 * 10**9] * 2
+    assert limits == [4 * 10**9] * 2  # twice the memory that the fixture gives a task
 
 
 def test_a_killed_worker_is_replaced_and_its_task_done(
