@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from random import Random
 from types import SimpleNamespace
 from typing import Any
 
@@ -23,7 +24,7 @@ from hypothesis import strategies as st
 from naps import Nap
 
 from tilestream.dataflow.plan import Plan
-from tilestream.dataflow.run import _Workers, dask_client, execute, report_kept
+from tilestream.dataflow.run import Frontier, _Workers, dask_client, execute, report_kept
 from tilestream.dataflow.tasks import Outcome, perform
 from tilestream.errors import PlanError, TaskError, TilestreamError, UsageError
 from tilestream.tiling import TileKey
@@ -63,6 +64,26 @@ def graph(edges: list[list[int]], failing: set[int]) -> list[Sum]:
         Sum(n, tuple(f"sum-{need % n}" for need in needs) if n else (), "ours" * (n in failing))
         for n, needs in enumerate(edges)
     ]
+
+
+@given(st.lists(st.sampled_from("abc"), min_size=1, max_size=30), st.integers(1, 6), st.randoms())
+def test_a_stage_begins_with_one_task_alone(stages: list[str], slots: int, chance: Random) -> None:
+    """However many may run at once, and in whatever order they end."""
+    tasks = [Sum(n, stage=stage) for n, stage in enumerate(stages)]
+    frontier = Frontier(tasks)
+    running: list[Any] = []
+    ended: list[Any] = []
+    while True:
+        while len(running) < slots and (task := frontier.take()) is not None:
+            same = [other for other in running if other.stage == task.stage]
+            assert not same or any(other.stage == task.stage for other in ended)
+            running.append(task)
+        if not running:
+            break
+        task = running.pop(chance.randrange(len(running)))
+        assert [o.key for o in frontier.learn(Outcome(task.key, task.stage, None))] == [task.key]
+        ended.append(task)
+    assert sorted(ended, key=lambda task: task.number) == tasks
 
 
 @given(

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import islice
 from typing import Any
 
 import dask.config
@@ -32,6 +33,8 @@ RETRIES = 2
 """How often a task is tried again whose failure may be passing."""
 PATIENCE = 600.0
 """How long a scheduler may be without any worker before the run is given up [s]."""
+LOOK_AHEAD = 64
+"""Tasks among which one is looked for whose stage is not held by its first task."""
 IN_FLIGHT_PER_THREAD = 4
 """Tasks handed to Dask at a time, per thread of its workers."""
 LOOK_EVERY = 2.0
@@ -110,13 +113,16 @@ class Frontier:
 
     What others wait for comes in the order of the plan; what has just become possible comes first,
     so that a tile goes through all stages while its neighbourhood is at hand, and no stage waits
-    for the end of another.
+    for the end of another. A stage begins with one task alone: it compiles the stage's kernels for
+    all workers that share a cache, while others begin with other stages.
     """
 
     def __init__(self, tasks: Sequence[Task], retries: int = RETRIES) -> None:
         self._tasks = {task.key: task for task in tasks}
         self._retries = retries
         self._tries: Counter[str] = Counter()
+        self._begun: set[str] = set()
+        self._tried: set[str] = set()
         self._ready: deque[Task] = deque()
         self._open: dict[str, int] = {}
         self._after: dict[str, list[Task]] = {}
@@ -131,7 +137,12 @@ class Frontier:
 
     def take(self) -> Task | None:
         """The next task that may run; None where none may until another one has ended."""
-        return self._ready.popleft() if self._ready else None
+        for place, task in enumerate(islice(self._ready, LOOK_AHEAD)):
+            if task.stage in self._tried or task.stage not in self._begun:
+                self._begun.add(task.stage)
+                del self._ready[place]
+                return task
+        return None
 
     def tries(self, key: str) -> int:
         """How often a task has failed so far."""
@@ -143,6 +154,7 @@ class Frontier:
         That is the outcome itself, unless the task is to be tried again, and those of the tasks
         that cannot run any more because of it.
         """
+        self._tried.add(outcome.stage)
         if outcome.passing and self._tries[outcome.key] < self._retries:
             self._tries[outcome.key] += 1
             self._ready.append(self._tasks[outcome.key])
