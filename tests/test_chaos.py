@@ -62,15 +62,15 @@ class Machine:
     def _kill_worker(self, rng: random.Random) -> None:
         until = time.monotonic() + PATIENCE
         while time.monotonic() < until:
-            nannies = [psutil.Process(process.pid) for process in self._processes[1:]]
-            workers = [
-                child
-                for nanny in nannies
-                for child in nanny.children()
-                if "spawn_main" in " ".join(child.cmdline())
-            ]
-            if workers:
-                with suppress(psutil.NoSuchProcess):
+            with suppress(psutil.NoSuchProcess, ProcessLookupError):  # it may end meanwhile
+                nannies = [psutil.Process(process.pid) for process in self._processes[1:]]
+                workers = [
+                    child
+                    for nanny in nannies
+                    for child in nanny.children()
+                    if "spawn_main" in " ".join(child.cmdline())
+                ]
+                if workers:
                     os.kill(rng.choice(workers).pid, signal.SIGKILL)
                     return
             time.sleep(0.05)
