@@ -87,7 +87,7 @@ def labels_of(places: pd.DataFrame, groups: tuple[str, ...], seed: int = 1) -> p
 
 
 def judged_by(models: list[str], protocols: tuple[str, ...]) -> pd.DataFrame:
-    """Rows as `evaluation.compare` returns them; the last protocol cannot be followed."""
+    """Rows of `evaluation.figures_by_protocol`; the last protocol cannot be followed."""
     rows: list[dict[str, Any]] = []
     for number, protocol in enumerate(protocols[:-1]):
         for k, model in enumerate(models):

@@ -40,7 +40,7 @@ def step_in_dataflow(name: str) -> int:
     """plan < tasks < dashboard < telling < run < a job's tasks < the jobs < those made of jobs."""
     first = ("plan", "progress", "tasks", "dashboard", "telling", "run", "run_settings")
     above = {"compare": 7, "estimate_tasks": 7, "main_plan": 8, "main_findings": 8}
-    above |= {"main_forecast": 9, "main_job": 9}
+    above |= {"main_estimate": 9, "main_forecast": 10, "main_job": 10}
     if name in above:
         return above[name]
     return first.index(name) if name in first else 5 if name.endswith("_tasks") else 6

@@ -18,13 +18,14 @@ from tilestream.forest.dataset import Dataset, join, with_derived
 from tilestream.forest.evaluation import (
     PAPER_TABLE,
     ceiling,
-    compare,
     criterion_importances,
+    factor_sets,
     figures,
+    figures_by_protocol,
     figures_of,
     held_out,
     importances,
-    table_iv,
+    judge,
 )
 from tilestream.forest.intervals import calibrate, coverage
 from tilestream.forest.models import (
@@ -206,17 +207,22 @@ def test_table_iv_has_every_protocol_and_factor_set(monkeypatch: pytest.MonkeyPa
         ),
     )
     found = dataset(2, related=0.9, lengths={"a": 410, "b": 300})
-    table = table_iv(found, "quick")
+    tables = []
+    for name, columns in factor_sets(found.columns).items():
+        judged = judge(found.with_columns(columns), "quick")
+        tables.append(figures_by_protocol(judged, "quick").assign(factors=name))
+    table = pd.concat(tables, ignore_index=True)
     assert len(table) == 3 * 4
     assert list(table["factors"].unique()) == list(PAPER_TABLE["factors"])
     assert (table["reason"] == "").all()
     assert np.isfinite(table["mae"]).all()
-    judged = table.groupby("protocol")["points"].first().to_dict()
-    assert judged == {"paper": 178, "path": 710, "blocks": 710}
+    points = table.groupby("protocol")["points"].first().to_dict()
+    assert points == {"paper": 178, "path": 710, "blocks": 710}
 
 
 def test_a_protocol_that_cannot_be_followed_says_why() -> None:
-    table = compare(dataset(2, lengths={"a": 120}), ["training median"])
+    found = judge(dataset(2, lengths={"a": 120}), "training median")
+    table = figures_by_protocol(found, "training median")
     reasons = dict(zip(table["protocol"], table["reason"], strict=True))
     assert reasons["paper"] == ""
     assert "one path only" in reasons["path"]

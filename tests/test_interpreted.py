@@ -13,7 +13,7 @@ QUICK = ("cells", "formats_kernels", "nearest", "score_field", "vicinity", "virt
 
 
 @pytest.mark.parametrize(
-    ("files", "least"), [(QUICK, 25), pytest.param(["pairs"], 7, marks=pytest.mark.slow)]
+    ("files", "least"), [(QUICK, 25), pytest.param(("pairs",), 7, marks=pytest.mark.slow)]
 )
 def test_kernels_say_the_same_without_the_compiler(files: tuple[str, ...], least: int) -> None:
     paths = [str(HERE / f"test_{name}.py") for name in files]

@@ -29,12 +29,12 @@ from tilestream.cli.jobs import judge_over, lost_labels
 from tilestream.cli.tables import forecast_rows
 from tilestream.dataflow import estimate_tasks, main_job
 from tilestream.dataflow.calibration import calibration_file, core_hours, learn
+from tilestream.dataflow.main_estimate import plan_estimate
 from tilestream.dataflow.main_forecast import forecast
 from tilestream.dataflow.main_plan import (
     check_model,
     inputs_of,
     making_of,
-    plan_estimate,
     plan_measure,
     read_map,
 )

@@ -42,7 +42,7 @@ TRAIN_VERSION = 3
 FOREST_BYTES = 600_000_000
 """Memory of a task that grows forests, beyond the interpreter, for some thousand places."""
 
-LARGE = 0.10
+LARGE_ERROR = 0.10
 """Without training: an estimate above this has a reason [m] (the least error of the paper's
 Table I)."""
 MAY_BE_NAN = ("ob_cov_along", "ob_cov_across", "ob_cov_up", "ob_cov_yaw", "vd_median")
@@ -413,7 +413,7 @@ def physical(places: pd.DataFrame, offset: float) -> pd.DataFrame:
     """What the virtual drive says of places, in the columns of a model's estimates.
 
     There is no interval, and no training place to be like: `low`, `high`, `domain_distance` and
-    `in_domain` are empty. Estimates above `LARGE` have a reason.
+    `in_domain` are empty. Estimates above `LARGE_ERROR` have a reason.
     """
     good = places["status"] == "done"
     error = physics(places["vd_mean"].to_numpy(), offset)
@@ -430,7 +430,7 @@ def physical(places: pd.DataFrame, offset: float) -> pd.DataFrame:
     frame = pd.DataFrame({**blank, **values}, index=places.index)
     frame.loc[~good, list(values)] = np.nan
     reason = places["reason"].astype(object)
-    large = good & (error > LARGE)
+    large = good & (error > LARGE_ERROR)
     reason[large] = without_training(places[large])
     unknown = pd.array([None] * len(places), dtype="boolean")
     words: dict[str, Any] = {"in_domain": unknown, "status": places["status"], "reason": reason}

@@ -7,6 +7,7 @@ import numpy as np
 
 from tilestream.dataflow.ingest_map import plan_ingest
 from tilestream.dataflow.ingest_tasks import ScatterTask
+from tilestream.dataflow.main_estimate import plan_estimate
 from tilestream.dataflow.main_plan import (
     Inputs,
     check_model,
@@ -15,7 +16,6 @@ from tilestream.dataflow.main_plan import (
     inputs_of,
     is_simulated,
     map_scans,
-    plan_estimate,
     plan_measure,
     simulated_folder,
     simulations,

@@ -23,7 +23,6 @@ from typing import Any
 
 import joblib
 import numpy as np
-import pandas as pd
 import yaml
 
 from tilestream.dataflow.calibration import learn
@@ -37,12 +36,12 @@ from tilestream.dataflow.estimate_tasks import (
 from tilestream.dataflow.factors_tasks import FactorsTask
 from tilestream.dataflow.ingest_map import SourcesRead
 from tilestream.dataflow.localize_tasks import LabelTask, RegisterTask
+from tilestream.dataflow.main_estimate import plan_estimate
 from tilestream.dataflow.main_findings import Done, findings_of
 from tilestream.dataflow.main_plan import (
     Inputs,
     check_model,
     inputs_of,
-    plan_estimate,
     plan_measure,
     read_map,
 )
@@ -55,6 +54,7 @@ from tilestream.errors import PartialError, UsageError
 from tilestream.forest.dataset import Dataset
 from tilestream.forest.model_file import load_model
 from tilestream.report import write_report
+from tilestream.report.summary import plain
 from tilestream.tables import remove_others
 from tilestream.version import VERSION
 
@@ -336,7 +336,7 @@ def _report(
         facts,
         model=settings.model,
     )
-    text = json.dumps(_plain(evaluation), indent=1, allow_nan=False)
+    text = json.dumps(plain(evaluation), indent=1, allow_nan=False)
     _write_text(settings.folder / "tables" / "evaluation.json", text + "\n")
     write_report(found, settings.folder / "report", threshold=settings.report.threshold)
     book.facts["report"] = str(settings.folder / "report" / "index.html")
@@ -395,15 +395,3 @@ def _model_facts(settings: RunSettings, book: _Book) -> dict[str, Any]:
     if not any(outcome.stage == TrainTask.stage and outcome.ok for outcome in book.outcomes):
         return {"from": "none: it could not be trained", "recipe": settings.model.recipe}
     return {"from": "trained here", **load_model(settings.folder / "model.skops").facts}
-
-
-def _plain(value: Any) -> Any:
-    """As JSON has it: no NaN, no NumPy."""
-    if isinstance(value, Mapping):
-        return {str(name): _plain(inner) for name, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(inner) for inner in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    missing = value is None or (not isinstance(value, str) and bool(pd.isna(value)))
-    return None if missing else value

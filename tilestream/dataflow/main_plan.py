@@ -10,54 +10,32 @@ from tilestream.config import IngestSettings
 from tilestream.dataflow.along_routes import plan_factors, plan_observe
 from tilestream.dataflow.estimate_tasks import (
     COLUMNS,
-    JOIN_VERSION,
-    TRAIN_VERSION,
-    JoinTask,
-    JudgeTask,
-    PredictTask,
-    TrainTask,
-    WeighTask,
-    file_hash,
-    predictions_identity,
-    train_identity,
 )
-from tilestream.dataflow.factors_tasks import FactorsTask, Looking
+from tilestream.dataflow.factors_tasks import Looking
 from tilestream.dataflow.ingest_map import SourcesRead, read_sources
 from tilestream.dataflow.localize_drive import plan_localize
-from tilestream.dataflow.localize_tasks import LabelTask, Reading
-from tilestream.dataflow.observe_tasks import ObserveTask, Observing
+from tilestream.dataflow.localize_tasks import Reading
+from tilestream.dataflow.observe_tasks import Observing
 from tilestream.dataflow.plan import Plan, Task
 from tilestream.dataflow.run import Watch
 from tilestream.dataflow.run_settings import (
     DriveSettings,
-    ModelSettings,
     RunSettings,
     SimulateSettings,
 )
 from tilestream.dataflow.simulate import simulate
-from tilestream.dataflow.tasks import Outcome
 from tilestream.errors import ModelError, SourceNotFoundError, UsageError
-from tilestream.factors import catalogue
 from tilestream.factors.rows import samples_by_tile
-from tilestream.factors.virtual_drive import NEIGHBOURS
 from tilestream.factors.virtual_scan import VirtualSettings
-from tilestream.forest.dataset import TARGETS, features_of, made_with
-from tilestream.forest.evaluation import factor_sets
+from tilestream.forest.dataset import made_with
 from tilestream.forest.model_file import load_model
-from tilestream.forest.models import COMPETITORS, PHYSICS
-from tilestream.forest.training import MAIN, check_making
+from tilestream.forest.training import check_making
 from tilestream.formats.mcap import ScanSelection
 from tilestream.formats.routes import read_routes
 from tilestream.records import Route
 from tilestream.simulation.settings import SimulationSettings, load_preset
-from tilestream.store import TileStore, hash_of, open_store
-from tilestream.tiling import MM_PER_M, TileGrid, TileKey
-from tilestream.version import VERSION
-
-OPPONENT = "training median"
-"""Whom a part of the error is judged against: the others know no more of unseen paths."""
-NEIGHBOURS_MM = round(NEIGHBOURS * MM_PER_M) + 1
-"""How far from a tile a sample point of it may have neighbours, rounding included [mm]."""
+from tilestream.store import TileStore, open_store
+from tilestream.tiling import TileKey
 
 
 @dataclass(frozen=True)
@@ -344,120 +322,3 @@ def reading_of(drive: DriveSettings) -> Reading:
         drive.deskew or drive.sweep_s is not None,
         drive.sweep_s,
     )
-
-
-def plan_estimate(
-    settings: RunSettings, grid: TileGrid, measure: Plan, outcomes: Sequence[Outcome]
-) -> Plan:
-    """Join, judge, train, predict: from what was measured.
-
-    What failed is left out here and listed by the run, so that a tile that cannot be read does not
-    keep the rest of the city from its estimates. A tile whose virtual drive failed is left out too:
-    nothing is learnt or estimated without it where it was asked for.
-    """
-    done = {outcome.key for outcome in outcomes if outcome.ok}
-    factors = [t for t in measure.tasks if isinstance(t, FactorsTask) and t.key in done]
-    labels = [t for t in measure.tasks if isinstance(t, LabelTask) and t.key in done]
-    observed = {t.tile: t for t in measure.tasks if isinstance(t, ObserveTask) and t.key in done}
-    if settings.observe is not None:
-        factors = [task for task in factors if task.tile in observed]
-    making = making_of(settings)
-    tables, tasks = f"{settings.out}/tables", list[Task]()
-    model, state = str(settings.folder / "model.skops"), ""
-    if labels and factors:
-        groups: dict[str, list[str]] = {}
-        for label in labels:
-            groups.setdefault(label.group, []).append(label.out)
-        identity = hash_of(
-            [t.identity for t in factors],
-            [t.identity for t in observed.values()],
-            [t.identity for t in labels],
-            making,
-            JOIN_VERSION,
-            VERSION,
-        )
-        join = JoinTask(
-            tuple(task.out for task in factors),
-            tuple(task.out for task in observed.values()),
-            tuple((group, tuple(paths)) for group, paths in groups.items()),
-            tuple(making.items()),
-            f"{tables}/samples/dataset.parquet",
-            identity,
-            sum(task.work for task in labels),
-        )
-        tasks.append(join)
-        if settings.model.use is None and settings.model.recipe != "physics":
-            state = train_identity(identity, settings.model.recipe, settings.model.seed)
-            seed = settings.model.seed
-            tasks.append(
-                TrainTask(
-                    dataset=join.out,
-                    recipe=settings.model.recipe,
-                    seed=seed,
-                    out=model,
-                    identity=state,
-                )
-            )
-            tasks += judges(join, f"{tables}/judged", settings.model, bool(observed))
-            tasks.append(
-                WeighTask(
-                    dataset=join.out,
-                    model=model,
-                    seed=seed,
-                    out=f"{tables}/judged/weights.parquet",
-                    identity=hash_of("weigh", state),
-                )
-            )
-    if settings.model.use is not None:
-        model, state = settings.model.use, file_hash(settings.model.use)
-    if settings.model.recipe == "physics":
-        model, state = "", f"physics {settings.model.offset}"
-    if state:
-        for task in factors:
-            near = grid.core(task.tile).grown(NEIGHBOURS_MM)
-            seen = [observed[key] for key in grid.keys_over(near) if key in observed]
-            inputs = [task.identity, *(one.identity for one in seen)]
-            tasks.append(
-                PredictTask(
-                    model,
-                    state,
-                    task.out,
-                    tuple(one.out for one in seen),
-                    task.tile,
-                    tuple(making.items()),
-                    f"{tables}/predictions/{task.tile}.parquet",
-                    predictions_identity(state, inputs, making),
-                    task.work,
-                    settings.model.offset,
-                )
-            )
-    return Plan(tuple(tasks), settings.memory).check()
-
-
-def judges(join: JoinTask, folder: str, model: ModelSettings, observed: bool) -> list[Task]:
-    """Every model and opponent on all factors, the forests on each set of Table IV; the parts of
-    the error by the forest in use, the virtual drive and the training median.
-    """
-    seed = model.seed
-    columns = features_of(COLUMNS if observed else catalogue.COLUMNS)
-    *sets, _ = factor_sets(columns)  # the last has all factors, as the competitors have
-    known = [name for name in COMPETITORS if observed or name not in PHYSICS]
-    wanted = [(MAIN, competitor, "") for competitor in known]
-    wanted += [(MAIN, "paper", name) for name in sets]
-    wanted += [(MAIN, "default", name) for name in sets if "LS" in name and "ob" not in name]
-    of_parts = [model.recipe, *(name for name in known if name in PHYSICS), OPPONENT]
-    wanted += [(target, name, "") for target in TARGETS if target != MAIN for name in of_parts]
-    return [
-        JudgeTask(
-            dataset=join.out,
-            competitor=competitor,
-            target=target,
-            factor_set=factor_set,
-            seed=seed,
-            out=f"{folder}/{target}-{competitor}-{factor_set or 'all'}.parquet".replace(" ", "_"),
-            identity=hash_of(
-                join.identity, target, competitor, factor_set, seed, TRAIN_VERSION, VERSION
-            ),
-        )
-        for target, competitor, factor_set in wanted
-    ]

@@ -133,23 +133,6 @@ def factor_sets(columns: Sequence[Column]) -> dict[str, tuple[Column, ...]]:
     return {name: chosen for name, chosen in sets.items() if chosen}
 
 
-def compare(
-    dataset: Dataset, competitors: Sequence[str], target: str = "error_mean", seed: int = 0
-) -> pd.DataFrame:
-    """Competitors side by side on every protocol, all on the same points.
-
-    Returns:
-        A row per protocol and competitor: `protocol`, `model`, the fields of `Figures`, `reason`
-        (why a protocol cannot be followed on this dataset; its figures are then NaN).
-
-    Raises:
-        ModelError: nothing can be learnt from the dataset.
-    """
-    dataset.check(target)
-    judged = {name: judge(dataset, name, target, seed) for name in competitors}
-    return pd.concat([figures_by_protocol(found, name) for name, found in judged.items()])
-
-
 def judge(
     dataset: Dataset, competitor: str, target: str = "error_mean", seed: int = 0
 ) -> dict[str, pd.DataFrame | str]:
@@ -170,7 +153,12 @@ def judge(
 
 
 def figures_by_protocol(judged: Mapping[str, pd.DataFrame | str], model: str) -> pd.DataFrame:
-    """What `judge` found as figures: the rows of one model of `compare`."""
+    """What `judge` found as figures.
+
+    Returns:
+        A row per protocol: `protocol`, `model`, the fields of `Figures`, `reason` (why a protocol
+        cannot be followed on this dataset; its figures are then NaN).
+    """
     rows: list[dict[str, object]] = []
     for protocol, points in judged.items():
         row: dict[str, object] = {"protocol": protocol, "model": model}
@@ -180,21 +168,6 @@ def figures_by_protocol(judged: Mapping[str, pd.DataFrame | str], model: str) ->
             rows.append(row | asdict(figures_of(points)) | {"reason": ""})
     names = ["protocol", "model", *(f.name for f in fields(Figures)), "reason"]
     return pd.DataFrame(rows).reindex(columns=names)
-
-
-def table_iv(
-    dataset: Dataset, competitor: str = "paper", target: str = "error_mean", seed: int = 0
-) -> pd.DataFrame:
-    """The paper's Table IV on every protocol, and with the robust factors where there are any.
-
-    Returns:
-        As `compare`, with a column `factors`: the name of the factor set.
-    """
-    tables = [
-        compare(dataset.with_columns(columns), [competitor], target, seed).assign(factors=name)
-        for name, columns in factor_sets(dataset.columns).items()
-    ]
-    return pd.concat(tables, ignore_index=True)
 
 
 def ceiling(dataset: Dataset, target: str = "error_mean") -> Figures:

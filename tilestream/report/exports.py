@@ -30,13 +30,14 @@ GEOPARQUET = "1.1.0"
 POINT_Z = 1001
 """ISO WKB code of a point with z."""
 _WKB = np.dtype([("order", "u1"), ("kind", "<u4"), ("xyz", "<f8", 3)])
-_TURNED = (WEAK_ALONG, SPREAD_ALONG, SPREAD_ACROSS)
 _CATALOGUE = {
     column.name: column
     for column in (
         *PLACE_COLUMNS,
         *catalogue.COLUMNS,
-        *_TURNED,
+        WEAK_ALONG,
+        SPREAD_ALONG,
+        SPREAD_ACROSS,
         *observability.COLUMNS,
         *PREDICTION_COLUMNS,
     )

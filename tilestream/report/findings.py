@@ -45,11 +45,11 @@ class Findings:
     that model has an interval of its own; else it is the factor of `coverage`.
     A row that repeats another in every column counts once."""
     protocols: pd.DataFrame = field(default_factory=_none)
-    """`evaluation.compare` of the mean error."""
+    """`evaluation.figures_by_protocol` of the mean error, of every model."""
     parts: pd.DataFrame = field(default_factory=_none)
-    """The same of the parts of the error, with the column `target`."""
+    """Of the parts of the error, with the column `target`."""
     table_iv: pd.DataFrame = field(default_factory=_none)
-    """`evaluation.table_iv`."""
+    """The same of each factor set, with the column `factors`: its name."""
     importances: pd.DataFrame = field(default_factory=_none)
     """`evaluation.importances`, with the column `model`: `used` of the forest that made the
     estimates, `paper` of the paper's on its own factors."""
