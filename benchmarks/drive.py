@@ -19,9 +19,9 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 import tilestream as ts
-from tilestream.dataflow.localize_tasks import Reading
-from tilestream.dataflow.plan import DEFAULT_MEMORY
-from tilestream.dataflow.run import dask_client
+from tilestream.pipeline.engine.cluster import dask_client
+from tilestream.pipeline.engine.plan import DEFAULT_MEMORY
+from tilestream.pipeline.stages.drive_scans import Reading
 
 mpl.use("Agg")
 HERE = Path(__file__).resolve().parent

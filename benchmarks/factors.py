@@ -27,7 +27,6 @@ import literal
 from streets import TILE, Floats, long_street, street_tile
 
 import tilestream as ts
-from tilestream.dataflow.along_routes import factors_along
 from tilestream.factors.catalogue import CRITERIA, columns_of
 from tilestream.factors.local_similarity import NEIGHBOUR_RADIUS
 from tilestream.factors.table import factors_at
@@ -38,6 +37,7 @@ from tilestream.kernels import pairs
 from tilestream.kernels.cells import cell_of_points
 from tilestream.kernels.neighbours import neighbours_within
 from tilestream.ndt import cells_of_mm
+from tilestream.pipeline.jobs.along_routes import factors_along
 from tilestream.records import Route
 
 CELL = 2.0

@@ -30,13 +30,13 @@ sys.path.insert(0, str(ROOT / "tests"))
 import numpy as np  # noqa: E402
 import pandas as pd  # noqa: E402
 from forest_data import COLUMNS, dataset, drives  # noqa: E402
-
 from tilestream.dataflow.estimate_tasks import PredictTask, places_with_factors  # noqa: E402
-from tilestream.dataflow.main_findings import Done, places_of  # noqa: E402
 from tilestream.dataflow.tasks import perform  # noqa: E402
+
 from tilestream.forest.model_file import load_model, save_model  # noqa: E402
 from tilestream.forest.reasons import contributions  # noqa: E402
 from tilestream.forest.training import predict, train  # noqa: E402
+from tilestream.pipeline.jobs.run_findings import Done, places_of  # noqa: E402
 from tilestream.report import Findings  # noqa: E402
 from tilestream.report.exports import write_geoparquet  # noqa: E402
 from tilestream.tiling import TileKey  # noqa: E402

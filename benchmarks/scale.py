@@ -26,10 +26,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from city_tiles import run_city, write_city
 from elsewhere import scheduler_elsewhere
 
-from tilestream.dataflow import along_routes, ingest_map
-from tilestream.dataflow.plan import Task
-from tilestream.dataflow.run import dask_client, execute
-from tilestream.dataflow.tasks import Outcome
+from tilestream.pipeline.engine.attempt import Outcome
+from tilestream.pipeline.engine.cluster import dask_client
+from tilestream.pipeline.engine.executor import execute
+from tilestream.pipeline.engine.stage import Task
+from tilestream.pipeline.jobs import along_routes
+from tilestream.pipeline.jobs import ingest as ingest_map
 
 SPACING = 0.4
 """Of the points of a block [m]."""

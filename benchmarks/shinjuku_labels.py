@@ -18,13 +18,13 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from tilestream.dataflow.localize_tasks import box_around
 
 import tilestream as ts
-from tilestream.dataflow.localize_tasks import box_around
-from tilestream.dataflow.plan import DEFAULT_MEMORY
-from tilestream.dataflow.run import dask_client
-from tilestream.dataflow.simulate import simulate
 from tilestream.formats.mcap import ScanSelection
+from tilestream.pipeline.engine.cluster import dask_client
+from tilestream.pipeline.engine.plan import DEFAULT_MEMORY
+from tilestream.pipeline.jobs.simulate import simulate
 from tilestream.records import Float64
 from tilestream.simulation.city import build_city
 from tilestream.simulation.drive import scans

@@ -29,8 +29,6 @@ from scipy.stats import spearmanr
 from streets import TILE, Floats, long_street
 
 import tilestream as ts
-from tilestream.dataflow.along_routes import observe_along
-from tilestream.dataflow.run_settings import DriveSettings, RunSettings, read_settings
 from tilestream.factors.ghosts import ghosts_among
 from tilestream.factors.observability import (
     box_around,
@@ -46,6 +44,8 @@ from tilestream.formats.mcap import open_log
 from tilestream.formats.pcd import write_pcd
 from tilestream.formats.routes import route_of
 from tilestream.kernels.virtual_scan import cast
+from tilestream.pipeline.jobs.along_routes import observe_along
+from tilestream.pipeline.jobs.run_settings import DriveSettings, RunSettings, read_settings
 from tilestream.tiling import MM_PER_M
 
 BINS = (0.0, 5.0, 10.0, 20.0, 30.0, 50.0, 100.0)

@@ -16,9 +16,9 @@ from scenes import PLACES, in_map
 
 import tilestream as ts
 from tilestream.config import StartSettings
-from tilestream.dataflow.run import Watch
 from tilestream.formats.las import write_las
 from tilestream.formats.routes import route_of
+from tilestream.pipeline.engine.executor import Watch
 
 OFFSETS_AT = 155
 """Where the header of a LAS file has its three offsets, then highest and lowest of each axis."""

@@ -87,7 +87,9 @@ def shared_data() -> Path:
 @pytest.fixture(scope="session")
 def _workers() -> Iterator[Any]:
     # not imported above: the process that only hands tests out reads this file too, and must wait
-    with import_module("tilestream.dataflow.run").dask_client(None, 2, 2 * 10**9) as client:
+    with import_module("tilestream.pipeline.engine.cluster").dask_client(
+        None, 2, 2 * 10**9
+    ) as client:
         yield client
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import distributed
 
-from tilestream.dataflow.run import ONE_THREAD, TlsFiles
+from tilestream.pipeline.engine.cluster import ONE_THREAD, TlsFiles
 
 
 def certificates(folder: Path) -> TlsFiles:

@@ -7,8 +7,8 @@ import numpy as np
 from logs import SECOND, START, pose
 from scenes import PLACES, in_map
 
-from tilestream.dataflow.run_settings import RunSettings
 from tilestream.formats.pcd import write_pcd
+from tilestream.pipeline.jobs.run_settings import RunSettings
 
 STREETS = {"canyon": 0.0, "tunnel": 400.0, "crossing": 800.0}
 """Kind of each street, and where it begins [m, map x]."""

@@ -25,7 +25,7 @@ CLIENT = """
 import sys
 sys.path.insert(0, {tests!r})
 from city_tiles import run_city
-from tilestream.dataflow.run import dask_client
+from tilestream.pipeline.engine.cluster import dask_client
 
 with dask_client(sys.argv[1], None, 10**9) as client:
     run_city({folder!r}, {out!r}, {n}, {size}, client=client)

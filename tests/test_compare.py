@@ -15,14 +15,14 @@ from report_json import charts, source
 from scenes import PLACES
 
 import tilestream as ts
+from tilestream.apps.compare import Choice, choices_of, compare, plan_compare
 from tilestream.cli import run
-from tilestream.dataflow.along_routes import observe_along
-from tilestream.dataflow.compare import Choice, choices_of, compare, plan_compare
-from tilestream.dataflow.plan import DEFAULT_MEMORY
 from tilestream.errors import UsageError
 from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.formats.pcd import write_pcd
 from tilestream.formats.routes import route_of
+from tilestream.pipeline.engine.plan import DEFAULT_MEMORY
+from tilestream.pipeline.jobs.along_routes import observe_along
 from tilestream.report.comparison import CELL_BYTES, Comparison
 from tilestream.report.comparison_page import write_comparison
 from tilestream.store import cells_table
@@ -153,12 +153,13 @@ def test_no_number_of_workers_shows_and_what_is_done_is_kept(
 ) -> None:
     store = ts.ingest(street, tmp_path / "map.zarr", tile_size=20.0)
     results: list[object] = []
-    watch = lambda outcome, *_: results.append(outcome.result)  # noqa: E731
+    watch = lambda outcome, *_: results.append(outcome.made)  # noqa: E731
     other = compare(store, [route], tmp_path / "out", CHOICES, client=workers, **HOW)
     pd.testing.assert_frame_equal(other.rows, found.rows, check_exact=True)
     pd.testing.assert_frame_equal(other.cells, found.cells, check_exact=True)
     again = compare(store, [route], tmp_path / "out", CHOICES[1:], watch=watch, **HOW)
-    assert {result for result in results if isinstance(result, int)} == {0}
+    assert results
+    assert not any(results)
     kept = found.rows[found.rows["choice"] != CHOICES[0].name].reset_index(drop=True)
     pd.testing.assert_frame_equal(again.rows, kept, check_exact=True)
 
@@ -177,7 +178,7 @@ def test_the_summary_counts_what_the_rows_and_the_store_say(
         assert sum(figures["missing"].values()) == len(rows) - len(done) > 0
         assert any("no ground" in reason for reason in figures["missing"])
         size_mm = round(choice.cell_size * 1000)
-        marks = store.marks(cells_table(size_mm)).values()
+        marks = store.marks(cells_table(size_mm).name).values()
         assert figures["cells"] == sum(mark.facts["cells"] for mark in marks) > 100
         assert figures["map_bytes"] == figures["cells"] * CELL_BYTES
 

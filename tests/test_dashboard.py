@@ -21,7 +21,8 @@ from hypothesis import strategies as st
 from naps import Nap
 from PIL import Image
 
-from tilestream.dataflow.dashboard import (
+from tilestream.pipeline.engine.cluster import dask_client
+from tilestream.pipeline.engine.dashboard import (
     GREY,
     RED,
     clock,
@@ -30,7 +31,9 @@ from tilestream.dataflow.dashboard import (
     stages_html,
     workers_html,
 )
-from tilestream.dataflow.progress import (
+from tilestream.pipeline.engine.events import page_url
+from tilestream.pipeline.engine.executor import execute
+from tilestream.pipeline.engine.progress import (
     DONE,
     FAILED,
     MOST_FAILURES,
@@ -40,8 +43,6 @@ from tilestream.dataflow.progress import (
     WAITING,
     Progress,
 )
-from tilestream.dataflow.run import dask_client, execute
-from tilestream.dataflow.telling import page_url
 from tilestream.tiling import TileKey
 
 EVIL = "<img src=x onerror=\"document.title='taken'\"> & 'quotes'"

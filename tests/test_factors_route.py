@@ -18,7 +18,9 @@ from tilestream.errors import SourceError, UsageError
 from tilestream.factors.rows import samples_by_tile
 from tilestream.formats.pcd import write_pcd
 from tilestream.formats.routes import resample, route_of, write_geojson_route
-from tilestream.store import POINTS, Mark, Tile
+from tilestream.marks import Mark
+from tilestream.pipeline.engine.attempt import Outcome
+from tilestream.store import POINTS, Tile
 from tilestream.tiling import TileGrid
 
 SENSOR = ts.VLP16.model_copy(update={"name": "short", "range_max": 25.0})
@@ -128,25 +130,30 @@ def test_no_tiling_and_no_number_of_workers_shows(
     pd.testing.assert_frame_equal(found, table)
 
 
+def rows_made(outcomes: list[Outcome]) -> int:
+    return sum(outcome.facts.get("rows", 0) for outcome in outcomes if outcome.made)
+
+
 def test_what_is_done_is_not_done_again_and_a_changed_map_is(
     street: Path, route: ts.Route, tmp_path: Path
 ) -> None:
     store = ts.ingest(street, tmp_path / "map.zarr", tile_size=20.0)
-    results: list[object] = []
+    results: list[Outcome] = []
 
     def work(**changes: object) -> pd.DataFrame:
         results.clear()
-        watch = lambda outcome, *_: results.append(outcome.result)  # noqa: E731
+        watch = lambda outcome, *_: results.append(outcome)  # noqa: E731
         how: dict[str, object] = {"spacing": 6.0, "sensor": SENSOR, "watch": watch} | changes
         return ts.factors_along(store, [route], tmp_path / "out", **how)
 
     first = work()
     pd.testing.assert_frame_equal(work(), first)
-    assert {r for r in results if isinstance(r, int)} == {0}
+    assert results
+    assert not any(outcome.made for outcome in results)
     (tmp_path / "out" / "factors" / "0_-1.parquet").unlink()
     pd.testing.assert_frame_equal(work(), first)
     there = (first["x"] < 20.0) & (first["y"] < 0.0)
-    assert sum(r for r in results if isinstance(r, int)) == there.sum() > 0
+    assert rows_made(results) == there.sum() > 0
     assert work(sensor_height=1.0)["z"].tolist() != first["z"].tolist()
 
 
@@ -154,13 +161,13 @@ def test_a_route_elsewhere_redoes_nothing_here(
     store: ts.TileStore, route: ts.Route, tmp_path: Path
 ) -> None:
     rows: dict[str, object] = {}
-    watch = lambda outcome, *_: rows.update({outcome.key: outcome.result})  # noqa: E731
+    watch = lambda outcome, *_: rows.update({outcome.key: outcome.made})  # noqa: E731
     how: dict[str, object] = {"spacing": 6.0, "sensor": SENSOR, "watch": watch}
     alone = ts.factors_along(store, [route], tmp_path, **how)
     here = {key for key in rows if key.startswith("factors")}
     away = route_of("away", np.array([[100.0, 50.0, 0.0], [112.0, 50.0, 0.0]]))
     both = ts.factors_along(store, [away, route], tmp_path, **how)
-    assert {rows[key] for key in here} == {0}
+    assert {rows[key] for key in here} == {False}
     pd.testing.assert_frame_equal(both[3:].reset_index(drop=True), alone)
 
 
@@ -170,7 +177,7 @@ def test_every_column_is_documented_in_the_file(table: pd.DataFrame, street: Pat
     assert schema.names == table.columns.tolist()
     for field in schema:
         assert field.metadata[b"meaning"], field.name
-    data_set = json.loads(schema.metadata[b"tilestream"])["data_set"]
+    data_set = json.loads(schema.metadata[b"tilestream"])["facts"]["data_set"]
     assert data_set["sensor"]["name"] == "short"
     assert data_set["cell_size"] == 2.0
 

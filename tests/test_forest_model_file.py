@@ -18,8 +18,6 @@ from hypothesis import strategies as st
 from scipy.stats import spearmanr
 from sklearn.linear_model import LinearRegression
 
-from tilestream.dataflow.estimate_tasks import COLUMNS as COLUMNS_LEARNT
-from tilestream.dataflow.estimate_tasks import physical
 from tilestream.errors import ModelError, SourceNotFoundError, UsageError
 from tilestream.forest import model_file, training
 from tilestream.forest.dataset import TARGETS, Dataset, features_of, join, made_with
@@ -37,6 +35,8 @@ from tilestream.forest.reasons import (
     typical_of,
 )
 from tilestream.forest.training import PREDICTION_COLUMNS, Model, predict, train
+from tilestream.pipeline.stages.predict import physical
+from tilestream.pipeline.stages.samples import COLUMNS as COLUMNS_LEARNT
 from tilestream.records import Column
 from tilestream.sensors import HDL64, VLP16
 

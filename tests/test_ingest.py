@@ -1,7 +1,6 @@
 """Ingest: the same tiles from any blocks, workers and interruptions; bad input is named."""
 
 import hashlib
-import importlib
 import os
 import shutil
 import signal
@@ -19,7 +18,6 @@ from hypothesis import strategies as st
 
 import tilestream as ts
 from tilestream.config import IngestSettings
-from tilestream.dataflow import ingest_map, ingest_tasks, plan
 from tilestream.errors import (
     CrsError,
     PartialError,
@@ -31,6 +29,8 @@ from tilestream.errors import (
 from tilestream.formats import open_source
 from tilestream.formats.las import write_las
 from tilestream.formats.pcd import write_pcd
+from tilestream.pipeline.engine import plan
+from tilestream.pipeline.jobs import ingest as ingest_map
 from tilestream.store import POINTS
 
 
@@ -111,8 +111,8 @@ def test_any_tile_and_block_size_stores_the_points_of_the_definition(
     cloud = rng.normal(0.0, 2.0, (800, 3))
     write_pcd(tmp_path / "a.pcd", cloud[:500])
     write_pcd(tmp_path / "b.pcd", cloud[500:])
-    monkeypatch.setattr(ingest_tasks, "MAX_BLOCK_POINTS", block)
-    monkeypatch.setattr(ingest_tasks, "MIN_BLOCK_POINTS", block)
+    monkeypatch.setattr(scatter, "MAX_BLOCK_POINTS", block)
+    monkeypatch.setattr(scatter, "MIN_BLOCK_POINTS", block)
     monkeypatch.setattr(ingest_map, "POINTS_PER_TASK", span)
     url = tmp_path / "map.zarr"
     shutil.rmtree(url, ignore_errors=True)
@@ -147,14 +147,11 @@ def test_strips_change_nothing(
     clouds: list[Path], reference: ts.TileStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     strips: list[object] = []
-    module = importlib.import_module("tilestream.ingest")  # ts.ingest is the function
-    thin = module.thin
-    monkeypatch.setattr(module, "thin", lambda *what: strips.append(what) or thin(*what))
-    monkeypatch.setattr(ingest_tasks, "MAX_BLOCK_POINTS", 20_000)
-    monkeypatch.setattr(ingest_tasks, "BASE_BYTES", 3_950_000)
-    monkeypatch.setattr(ingest_tasks, "BYTES_PER_TILE_POINT", 10_000)
-    store = ts.ingest(clouds, tmp_path / "map.zarr", tile_size=10.0, map_leaf=0.5, memory=9_000_000)
-    assert len(strips) > len(store.keys())
+    thin = merge.thin
+    monkeypatch.setattr(merge, "thin", lambda *what: strips.append(what) or thin(*what))
+    monkeypatch.setattr(merge, "strips_fitting", lambda *_: 5)
+    store = ts.ingest(clouds, tmp_path / "map.zarr", tile_size=10.0, map_leaf=0.5)
+    assert len(strips) == 5 * len(store.keys())
     assert store.marks() == reference.marks()
     for key in store.keys():
         np.testing.assert_array_equal(store.tile(key).points(), reference.tile(key).points())

@@ -21,14 +21,16 @@ from scenes import PLACES, in_map
 import tilestream as ts
 from tilestream.cli import run
 from tilestream.config import StartSettings
-from tilestream.dataflow.localize_drive import REACH, choose_samples
-from tilestream.dataflow.localize_tasks import ERROR_COLUMNS, START_COLUMNS, Reading
-from tilestream.dataflow.tasks import Outcome
 from tilestream.errors import PartialError, PoseError, TileNotReadyError, UsageError
 from tilestream.formats.lesser import as_lesser
 from tilestream.formats.mcap import open_log
 from tilestream.formats.pcd import write_pcd
 from tilestream.localization import refined_pose, start_poses
+from tilestream.pipeline.engine.attempt import Outcome
+from tilestream.pipeline.jobs.localize import REACH, choose_samples
+from tilestream.pipeline.stages.drive_scans import Reading
+from tilestream.pipeline.stages.label import ERROR_COLUMNS
+from tilestream.pipeline.stages.register import START_COLUMNS
 from tilestream.records import Cells
 from tilestream.store import POINTS, Mark, Tile
 from tilestream.tables import read_mark, read_tables
@@ -129,7 +131,7 @@ class Redone:
 
     def __call__(self, outcome: Outcome, *_: int) -> None:
         if outcome.stage == "register":
-            (self.registers if outcome.result else self.kept).append(outcome.key)
+            (self.registers if outcome.made else self.kept).append(outcome.key)
 
 
 # --- The labels
@@ -188,8 +190,7 @@ def test_a_lesser_sensor_changes_the_labels_and_is_recorded(
     assert labels["error_mean"][7] == expected.error_mean
     for path in tmp_path.rglob("*.parquet"):
         mark = read_mark(str(path))
-        assert mark is not None
-        assert mark["data_set"]["as_sensor"] == "8 beams, 12 m, rear blind 120 deg"
+        assert mark.facts["data_set"]["as_sensor"] == "8 beams, 12 m, rear blind 120 deg"
 
 
 def test_a_refined_true_pose_is_recorded_and_used(
@@ -240,10 +241,9 @@ def test_every_column_is_documented_in_the_files(plain: tuple[pd.DataFrame, Path
                 text = field.metadata[b"unit"] == b""
                 assert text == (field.name in {"true_pose", "as_sensor", "status", "reason"})
             mark = read_mark(str(path))
-            assert mark is not None
-            assert mark["data_set"]["registration"]["neighbours"] == "direct7"
-            assert mark["data_set"]["starts"]["radius"] == 0.4
-            assert mark["data_set"]["true_pose"] == "log"
+                assert mark.facts["data_set"]["registration"]["neighbours"] == "direct7"
+            assert mark.facts["data_set"]["starts"]["radius"] == 0.4
+            assert mark.facts["data_set"]["true_pose"] == "log"
 
 
 # --- However the work is cut

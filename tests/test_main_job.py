@@ -27,30 +27,6 @@ import tilestream as ts
 from tilestream.cli import run as command
 from tilestream.cli.jobs import judge_over, lost_labels
 from tilestream.cli.tables import forecast_rows
-from tilestream.dataflow import estimate_tasks, main_job
-from tilestream.dataflow.calibration import calibration_file, core_hours, learn
-from tilestream.dataflow.main_estimate import plan_estimate
-from tilestream.dataflow.main_forecast import forecast
-from tilestream.dataflow.main_plan import (
-    check_model,
-    inputs_of,
-    making_of,
-    plan_measure,
-    read_map,
-)
-from tilestream.dataflow.plan import Task
-from tilestream.dataflow.run import dask_client
-from tilestream.dataflow.run_settings import (
-    DriveSettings,
-    LabelSettings,
-    MapSettings,
-    ModelSettings,
-    ReportSettings,
-    RunSettings,
-    SimulateSettings,
-    read_settings,
-)
-from tilestream.dataflow.tasks import Outcome
 from tilestream.errors import (
     LimitError,
     ModelError,
@@ -65,11 +41,37 @@ from tilestream.forest.intervals import coverage
 from tilestream.forest.model_file import load_model, save_model
 from tilestream.forest.models import Recipe
 from tilestream.forest.training import PREDICTION_COLUMNS
+from tilestream.pipeline.engine.attempt import Outcome
+from tilestream.pipeline.engine.cluster import dask_client
+from tilestream.pipeline.engine.costs import calibration_file, core_hours, learn
+from tilestream.pipeline.engine.outputs import TileArrays
+from tilestream.pipeline.engine.stage import Task
+from tilestream.pipeline.jobs import run as main_job
+from tilestream.pipeline.jobs.forecast import forecast
+from tilestream.pipeline.jobs.run_inputs import check_model, inputs_of, making_of
+from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
+from tilestream.pipeline.jobs.run_settings import (
+    DriveSettings,
+    LabelSettings,
+    MapSettings,
+    ModelSettings,
+    ReportSettings,
+    RunSettings,
+    SimulateSettings,
+    read_settings,
+)
+from tilestream.pipeline.stages import predict as predict_stage
+from tilestream.pipeline.stages.map_plan import MapPlan
+from tilestream.pipeline.stages.terms import terms
 from tilestream.report import pictures
 from tilestream.report.evidence import MODELS
 from tilestream.simulation.settings import load_preset
 
 PIPELINES = Path(__file__).resolve().parents[1] / "pipelines"
+
+
+LEARNT = ("samples", "evaluate", "importance", "train", "predict")
+"""Stages after measuring."""
 
 
 class Told:
@@ -84,8 +86,8 @@ class Told:
 
     def worked(self) -> set[str]:
         """Stages of which a task after measuring wrote something."""
-        late = ("register", "label", "factors", "join", "judge", "weigh", "train", "predict")
-        return {o.stage for o in self.outcomes if o.stage in late and o.result}
+        late = ("register", "label", "factors", *LEARNT)
+        return {o.stage for o in self.outcomes if o.stage in late and o.made}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -276,7 +278,7 @@ def test_a_second_run_redoes_nothing(inputs: Path, copy: Path) -> None:
 def test_another_seed_redoes_the_models_only(inputs: Path, copy: Path) -> None:
     told = Told()
     ts.run(job(inputs, copy, model={"seed": 7}), watch=told)
-    assert told.worked() == {"judge", "weigh", "train", "predict"}
+    assert told.worked() == set(LEARNT) - {"samples"}
 
 
 @pytest.mark.slow
@@ -284,7 +286,7 @@ def test_another_matcher_redoes_the_labels_and_what_is_learnt(inputs: Path, copy
     told = Told()
     label = {"matcher": "autoware", "starts": {"radius": 0.4, "step": 0.2}}
     ts.run(job(inputs, copy, label=label), watch=told)
-    assert told.worked() == {"register", "label", "join", "judge", "weigh", "train", "predict"}
+    assert told.worked() == {"register", "label", *LEARNT}
     assert ts.dataset(copy).data_sets["canyon"]["registration"]["solver"] == "raw"
 
 
@@ -305,12 +307,12 @@ def test_a_changed_block_redoes_what_sees_it(inputs: Path, copy: Path, tmp_path:
     streets.write_pcd(changed / "map_tunnel.pcd", streets.street("tunnel", 2, 0.3))
     told = Told()
     ts.run(job(changed, tmp_path / "run"), watch=told)
-    redone = {o.key.split("-")[1] for o in told.outcomes if o.stage == "register" and o.result}
+    redone = {o.key.split("-")[1] for o in told.outcomes if o.stage == "register" and o.made}
     assert redone == {"tunnel"}
     tiles = {
         int(o.key.split("-", 1)[1].split("_")[0])
         for o in told.outcomes
-        if o.stage == "factors" and o.result
+        if o.stage == "factors" and o.made
     }
     assert tiles
     assert tiles <= {7, 8, 9}  # the tunnel begins at x = 400 m; tiles are 50 m wide
@@ -322,14 +324,14 @@ def test_a_changed_block_redoes_what_sees_it(inputs: Path, copy: Path, tmp_path:
 def test_a_task_that_fails_keeps_nothing_else_from_its_end(
     inputs: Path, copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    plain = estimate_tasks.predict
+    plain = predict_stage.predicted
 
     def failing(model: training.Model, factors: pd.DataFrame, made: object) -> pd.DataFrame:
         if (factors["route_id"] == "tunnel").any():
             raise ModelError("cannot be estimated here")
         return plain(model, factors, made)
 
-    monkeypatch.setattr(estimate_tasks, "predict", failing)
+    monkeypatch.setattr(predict_stage, "predicted", failing)
     with pytest.raises(PartialError, match="cannot be estimated here"):
         ts.run(job(inputs, copy, model={"seed": 3, "recipe": "paper"}))
     told = json.loads((copy / "run.json").read_text())
@@ -386,7 +388,7 @@ def test_a_model_is_applied_to_another_map(
     routes = [str(inputs / "canyon.mcap")]
     settings = job(inputs, tmp_path / "run", model=use, drives=[], routes=routes)
     ts.run(settings, watch=told)
-    assert not {o.stage for o in told.outcomes} & {"register", "join", "train", "judge"}
+    assert not {o.stage for o in told.outcomes} & {"register", "samples", "train", "evaluate"}
     here = pd.read_parquet(tmp_path / "run" / "report" / "places.parquet")
     there = pd.read_parquet(done[0] / "report" / "places.parquet")
     there = there[there["route_id"] == "canyon"].reset_index(drop=True)
@@ -500,17 +502,17 @@ def test_nothing_is_learnt_or_estimated_without_the_virtual_drive_that_was_asked
 ) -> None:
     settings = job(inputs, tmp_path / "run", observe={"range_max": 14.0})
     found = inputs_of(settings, None, None)
-    read = read_map(settings, found, None, None)
-    measure = plan_measure(settings, found, read.store, read.merges.tasks, read.identities)
+    store = ts.ingest(settings.map.sources, settings.store_url, tile_size=settings.map.tile_size)
+    measure = plan_measure(settings, found, MapPlan.of_store(store))
     observe = [task.key for task in measure.tasks if task.stage == "observe"]
 
     def planned(lost: list[str]) -> dict[str, list[Task]]:
         outcomes = [
-            Outcome(task.key, task.stage, None, "lost" if task.key in lost else "")
+            Outcome(task.key, task.stage, reason="lost" if task.key in lost else "")
             for task in measure.tasks
         ]
         stages: dict[str, list[Task]] = {}
-        for task in plan_estimate(settings, read.store.grid, measure, outcomes).tasks:
+        for task in plan_estimate(settings, store.grid, measure, outcomes).tasks:
             stages.setdefault(task.stage, []).append(task)
         return stages
 
@@ -518,7 +520,8 @@ def test_nothing_is_learnt_or_estimated_without_the_virtual_drive_that_was_asked
     assert [str(task.tile) for task in planned([])["predict"]] == tiles
     some = planned(observe[:1])
     assert [str(task.tile) for task in some["predict"]] == tiles[1:]
-    assert len(some["join"][0].factors) == len(some["join"][0].observed) == len(tiles) - 1
+    (joined,) = some["samples"]
+    assert len(joined.reads["factors"]) == len(joined.reads["observed"]) == len(tiles) - 1
     assert planned(observe) == {}
 
 
@@ -536,7 +539,7 @@ def test_physics_needs_no_drive(inputs: Path, tmp_path: Path) -> None:
     )
     told = Told()
     ts.run(settings, watch=told)
-    assert not {o.stage for o in told.outcomes} & {"register", "join", "train", "judge"}
+    assert not {o.stage for o in told.outcomes} & {"register", "samples", "train", "evaluate"}
     places = pd.read_parquet(tmp_path / "run" / "report" / "places.parquet")
     tiles = list((tmp_path / "run" / "tables" / "predictions").glob("*.parquet"))
     assert len(tiles) == 4  # the routes weave over y = 0: neighbours lie in another tile
@@ -864,7 +867,7 @@ def test_the_plan_tells_stages_memory_and_cost(
     stages = {row["stage"]: row for row in json.loads(capsys.readouterr().out)["stages"]}
     assert stages["factors"]["work"] == len(STREETS) * SCANS
     assert stages["label"]["after"] == ["register"]
-    assert stages["predict"]["after"] == ["train"]
+    assert stages["predict"]["after"] == ["factors", "observe", "train"]
     assert all(row["promised_bytes"] > 0 and row["core_hours"] >= 0 for row in stages.values())
     assert command(["run", str(config), "--dry-run"]) == 0
     assert "core-hours" in capsys.readouterr().out
@@ -905,16 +908,15 @@ def test_a_job_that_does_not_fit_is_refused_before_it_runs(
 def test_costs_are_learnt_from_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
 
-    class Work:
-        key, stage, work = "terms-1", "terms", 4
-        needs: tuple[str, ...] = ()
-        promised_bytes = 1
-
-    before = core_hours([Work()])["terms"]
-    learn([Work()], [Outcome("terms-1", "terms", 1, seconds=80.0)])
-    assert core_hours([Work()])["terms"] == pytest.approx((before + 80.0 / 3600.0) / 2.0)
+    task = Task(terms, "1", TileArrays("nowhere", ts.TileKey(0, 0), "terms"), work=4)
+    before = core_hours([task])["terms"]
+    assert before == pytest.approx(4 * terms.seconds / 3600.0)
+    learn([task], [Outcome("terms-1", "terms", made=False, seconds=80.0)])
+    assert core_hours([task])["terms"] == before
+    learn([task], [Outcome("terms-1", "terms", made=True, seconds=80.0)])
+    assert core_hours([task])["terms"] == pytest.approx((before + 80.0 / 3600.0) / 2.0)
     calibration_file().write_text("{broken")
-    assert core_hours([Work()])["terms"] == before
+    assert core_hours([task])["terms"] == before
 
 
 # --- On Dask

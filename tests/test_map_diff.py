@@ -9,10 +9,10 @@ import pytest
 from scenes import scene
 
 import tilestream as ts
+from tilestream.apps.diff import diff
 from tilestream.cli import run
-from tilestream.dataflow.estimate_tasks import PLACE_COLUMNS
-from tilestream.dataflow.map_diff import diff
 from tilestream.errors import StoreNotFoundError, UsageError
+from tilestream.factors.rows import PLACE_COLUMNS
 from tilestream.forest.training import PREDICTION_COLUMNS
 from tilestream.formats.pcd import write_pcd
 from tilestream.tables import write_table

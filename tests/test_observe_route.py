@@ -11,16 +11,19 @@ import pytest
 from scenes import PLACES
 
 import tilestream as ts
-from tilestream.dataflow.along_routes import observe_along, plan_observe
-from tilestream.dataflow.observe_tasks import Observing
-from tilestream.dataflow.plan import DEFAULT_MEMORY
 from tilestream.errors import PlanError, UsageError
 from tilestream.factors.observability import observability
 from tilestream.factors.rows import samples_by_tile
 from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.formats.pcd import write_pcd
 from tilestream.formats.routes import route_of
-from tilestream.store import POINTS, Mark, Tile
+from tilestream.marks import Mark
+from tilestream.pipeline.engine.attempt import Outcome
+from tilestream.pipeline.engine.plan import DEFAULT_MEMORY
+from tilestream.pipeline.jobs.along_routes import observe_along, plan_observe
+from tilestream.pipeline.stages.map_plan import MapPlan
+from tilestream.pipeline.stages.observe import Observing
+from tilestream.store import POINTS, Tile
 
 SENSOR = ts.VLP16.model_copy(update={"name": "short", "azimuth_step_deg": 3.0})
 SEEING = VirtualSettings(range_max=15.0, starts=8)
@@ -71,26 +74,31 @@ def test_no_tiling_and_no_number_of_workers_shows(
     pd.testing.assert_frame_equal(found, table, check_exact=True)
 
 
+def rows_made(outcomes: list[Outcome]) -> int:
+    return sum(outcome.facts.get("rows", 0) for outcome in outcomes if outcome.made)
+
+
 def test_what_is_done_is_not_done_again_and_other_settings_are(
     street: Path, route: ts.Route, tmp_path: Path
 ) -> None:
     store = ts.ingest(street, tmp_path / "map.zarr", tile_size=20.0)
-    results: list[object] = []
+    results: list[Outcome] = []
 
     def work(**changes: object) -> pd.DataFrame:
         results.clear()
-        watch = lambda outcome, *_: results.append(outcome.result)  # noqa: E731
+        watch = lambda outcome, *_: results.append(outcome)  # noqa: E731
         how: dict[str, object] = HOW | {"watch": watch} | changes
         return observe_along(store, [route], tmp_path / "out", **how)
 
     first = work()
-    assert sum(r for r in results if isinstance(r, int)) == len(first)
+    assert rows_made(results) == len(first)
     pd.testing.assert_frame_equal(work(), first, check_exact=True)
-    assert {r for r in results if isinstance(r, int)} == {0}
+    assert results
+    assert not any(outcome.made for outcome in results)
     (tmp_path / "out" / "observability" / "0_-1.parquet").unlink()
     pd.testing.assert_frame_equal(work(), first, check_exact=True)
     there = (first["x"] < 20.0) & (first["y"] < 0.0)
-    assert sum(r for r in results if isinstance(r, int)) == there.sum() > 0
+    assert rows_made(results) == there.sum() > 0
     raw = ts.RegistrationSettings.autoware()
     assert work(registration=raw)["vd_mean"].tolist() != first["vd_mean"].tolist()
     blind = SEEING.model_copy(update={"blind_rear_deg": 180.0})
@@ -103,7 +111,7 @@ def test_every_column_and_every_setting_is_in_the_file(table: pd.DataFrame, stre
     assert schema.names == table.columns.tolist()
     for field in schema:
         assert field.metadata[b"meaning"], field.name
-    data_set = json.loads(schema.metadata[b"tilestream"])["data_set"]
+    data_set = json.loads(schema.metadata[b"tilestream"])["facts"]["data_set"]
     assert data_set["sensor"]["name"] == "short"
     assert data_set["seeing"]["range_max"] == 15.0
     assert data_set["registration"]["solver"] == "definite"
@@ -136,15 +144,15 @@ def test_places_without_map_are_rows_that_say_so(store: ts.TileStore, tmp_path: 
 
 def test_the_plan_says_what_it_needs(store: ts.TileStore, route: ts.Route, tmp_path: Path) -> None:
     observing = Observing(SENSOR, SEEING, ts.RegistrationSettings(), 2.0, 2.0)
-    samples = samples_by_tile(store.grid, [route], 6.0)
-    plan = plan_observe(store, samples, tmp_path, observing, DEFAULT_MEMORY)
+    samples, known = samples_by_tile(store.grid, [route], 6.0), MapPlan.of_store(store)
+    plan = plan_observe(known, samples, tmp_path, observing, DEFAULT_MEMORY)
     assert [stage for stage, *_ in plan.describe()] == ["cells", "surfels", "observe"]
     observe = [task for task in plan.tasks if task.stage == "observe"]
     assert sum(task.work for task in observe) == 9
-    known = {task.key for task in plan.tasks}
-    assert all(set(task.needs) <= known for task in observe)
+    keys = {task.key for task in plan.tasks}
+    assert all(set(task.needs) <= keys for task in observe)
     with pytest.raises(PlanError, match="allow more"):
-        plan_observe(store, samples, tmp_path, observing, 10**8)
+        plan_observe(known, samples, tmp_path, observing, 10**8)
     for routes in ([], [route, route]):
         with pytest.raises(UsageError, match="its own name"):
             observe_along(store, routes, tmp_path / "out")

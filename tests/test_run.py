@@ -7,8 +7,8 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from random import Random
 from types import SimpleNamespace
@@ -21,45 +21,24 @@ import pytest
 from elsewhere import certificates, scheduler_elsewhere
 from hypothesis import given
 from hypothesis import strategies as st
-from naps import Nap
+from naps import MEMORY, ORDER, After, Nap, Sum
 
-from tilestream.dataflow.plan import Plan
-from tilestream.dataflow.run import Frontier, _Workers, dask_client, execute, report_kept
-from tilestream.dataflow.tasks import Outcome, perform
-from tilestream.errors import PlanError, TaskError, TilestreamError, UsageError
+from tilestream.errors import PlanError, TaskError, UsageError
+from tilestream.pipeline.engine.attempt import Outcome
+from tilestream.pipeline.engine.cluster import dask_client, report_kept
+from tilestream.pipeline.engine.dask_executor import _Workers
+from tilestream.pipeline.engine.executor import execute
+from tilestream.pipeline.engine.frontier import Frontier
+from tilestream.pipeline.engine.plan import Plan
+from tilestream.pipeline.engine.stage import BASE_BYTES, Task
 from tilestream.tiling import TileKey
 
 
-@dataclass(frozen=True)
-class Sum:
-    """A task that fails where it is told to."""
-
-    number: int
-    needs: tuple[str, ...] = ()
-    error: str = ""
-    promised_bytes: int = 1
-    work: int = 2
-    stage: str = "sum"
-
-    @property
-    def key(self) -> str:
-        return f"sum-{self.number}"
+def planned(tasks: Sequence[Task]) -> Plan:
+    return Plan(tuple(tasks), MEMORY)
 
 
-ORDER: list[str] = []
-
-
-@perform.register
-def _sum(task: Sum) -> int:
-    ORDER.append(task.key)
-    if task.error == "ours":
-        raise TilestreamError("no such number")
-    if task.error:
-        raise ZeroDivisionError(task.error)
-    return task.number
-
-
-def graph(edges: list[list[int]], failing: set[int]) -> list[Sum]:
+def graph(edges: list[list[int]], failing: set[int]) -> list[Task]:
     return [
         Sum(n, tuple(f"sum-{need % n}" for need in needs) if n else (), "ours" * (n in failing))
         for n, needs in enumerate(edges)
@@ -70,7 +49,8 @@ def graph(edges: list[list[int]], failing: set[int]) -> list[Sum]:
 def test_a_stage_begins_with_one_task_alone(stages: list[str], slots: int, chance: Random) -> None:
     """However many may run at once, and in whatever order they end."""
     tasks = [Sum(n, stage=stage) for n, stage in enumerate(stages)]
-    frontier = Frontier(tasks)
+    frontier = Frontier()
+    frontier.add(tasks)
     running: list[Any] = []
     ended: list[Any] = []
     while True:
@@ -81,9 +61,9 @@ def test_a_stage_begins_with_one_task_alone(stages: list[str], slots: int, chanc
         if not running:
             break
         task = running.pop(chance.randrange(len(running)))
-        assert [o.key for o in frontier.learn(Outcome(task.key, task.stage, None))] == [task.key]
+        assert [o.key for o in frontier.learn(Outcome(task.key, task.stage))] == [task.key]
         ended.append(task)
-    assert sorted(ended, key=lambda task: task.number) == tasks
+    assert sorted(ended, key=lambda task: int(task.name)) == tasks
 
 
 @given(
@@ -95,10 +75,10 @@ def test_what_needs_a_failure_is_refused_and_all_else_runs_after_its_needs(
 ) -> None:
     tasks = graph(edges, failing)
     ORDER.clear()
-    outcomes = {outcome.key: outcome for outcome in execute(tasks, None, None)}
+    outcomes = {outcome.key: outcome for outcome in execute(planned(tasks), None, None)}
     bad: set[str] = set()
     for task in tasks:
-        if task.error or bad.intersection(task.needs):
+        if task.takes["error"] or bad.intersection(task.needs):
             bad.add(task.key)
     assert {key for key, outcome in outcomes.items() if not outcome.ok} == bad
     assert len(ORDER) == len(set(ORDER))
@@ -113,14 +93,12 @@ def test_what_needs_a_failure_is_refused_and_all_else_runs_after_its_needs(
 
 def test_dask_gives_the_same_outcomes_in_the_same_order(workers: distributed.Client) -> None:
     tasks = graph([[], [0], [], [1, 2], [3], [0], [5, 4]] + [[n] for n in range(40)], {2, 20})
-    here = execute(tasks, None, None)
+    here = execute(planned(tasks), None, None)
     seen: list[Outcome] = []
-    there = execute(tasks, workers, lambda outcome, *_: seen.append(outcome))
-    assert [(o.key, o.result, o.reason) for o in there] == [
-        (o.key, o.result, o.reason) for o in here
-    ]
+    there = execute(planned(tasks), workers, lambda outcome, *_: seen.append(outcome))
+    assert [(o.key, o.facts, o.reason) for o in there] == [(o.key, o.facts, o.reason) for o in here]
     assert len(seen) == len(tasks)
-    again = execute([Sum(0, error="odd")], workers, None)
+    again = execute(planned([Sum(0, error="odd")]), workers, None)
     assert again[0].reason == "ZeroDivisionError: odd"
     assert "Traceback" in again[0].details
 
@@ -128,7 +106,7 @@ def test_dask_gives_the_same_outcomes_in_the_same_order(workers: distributed.Cli
 def test_watchers_see_the_work_of_each_stage() -> None:
     seen: list[tuple[str, int, int]] = []
     tasks = [Sum(0), Sum(1, work=5), Sum(2, stage="other")]
-    execute(tasks, None, lambda outcome, *counts: seen.append((outcome.stage, *counts)))
+    execute(planned(tasks), None, lambda outcome, *counts: seen.append((outcome.stage, *counts)))
     assert seen == [("sum", 2, 7), ("sum", 7, 7), ("other", 2, 2)]
 
 
@@ -138,11 +116,12 @@ def test_no_cluster_is_started_for_one_worker() -> None:
 
 
 def test_a_plan_names_the_task_that_does_not_fit() -> None:
-    plan = Plan((Sum(0), Sum(1, promised_bytes=2 * 10**9)), memory=10**9)
+    tasks = (Sum(0), Sum(1, count=2 * 10**9 - BASE_BYTES))
+    plan = Plan.of(tasks, 2 * 10**9)
     assert plan.promised_bytes == 2 * 10**9
     assert list(plan.describe()) == [("sum", 2, 2 * 10**9)]
     with pytest.raises(PlanError, match=r"sum-1 needs 2,000 MB and may use 1,000 MB"):
-        plan.check()
+        Plan.of(tasks, 10**9)
 
 
 @pytest.mark.parametrize(
@@ -162,7 +141,7 @@ def test_what_may_pass_is_tried_again_and_a_verdict_stands(
     nap = Nap(TileKey(0, 0), failures=failures, how=how, notes=str(tmp_path))
     after = Nap(TileKey(0, 0), "after", needs=(nap.key,))
     other = Nap(TileKey(1, 0))
-    first, second, third = execute([nap, after, other], None, None, retries=2)
+    first, second, third = execute(planned([nap, after, other]), None, None, retries=2)
     assert len(list(tmp_path.iterdir())) == runs
     assert first.reason == reason
     assert second.reason == (f"not run, since {nap.key} failed: {reason}" if reason else "")
@@ -177,15 +156,75 @@ def test_a_tile_goes_through_all_stages_before_the_last_one_has_begun() -> None:
         for tile in tiles
     ]
     order: list[str] = []
-    execute(stages, None, lambda outcome, *_: order.append(outcome.key))
+    execute(planned(stages), None, lambda outcome, *_: order.append(outcome.key))
     assert order[:3] == ["cells-0_0", "terms-0_0", "factors-0_0"]
     assert len(order) == len(set(order)) == 150
+
+
+@pytest.mark.parametrize("on_dask", [False, True])
+def test_a_plan_grows_while_it_runs(on_dask: bool, request: pytest.FixtureRequest) -> None:
+    """What is added may need what is done, what is open and what has failed."""
+    client = request.getfixturevalue("workers") if on_dask else None
+    more = {
+        "sum-0": [Sum(2, ("sum-0",)), Sum(3, ("sum-1",)), Sum(4, ("sum-2",)), Sum(5, ("sum-3",))],
+        "sum-4": [Sum(6, ("sum-1", "sum-4")), Sum(7)],
+    }
+    totals: list[int] = []
+    outcomes = execute(
+        planned([Sum(0), Sum(1, error="ours")]),
+        client,
+        lambda _, ended, total: totals.append(total - ended),
+        grow=lambda outcome: more.get(outcome.key, ()),
+    )
+    assert [outcome.key for outcome in outcomes] == [f"sum-{n}" for n in range(8)]
+    assert [outcome.key for outcome in outcomes if not outcome.ok] == [
+        "sum-1",
+        "sum-3",
+        "sum-5",
+        "sum-6",
+    ]
+    assert {o.reason for o in outcomes if o.refused} == {
+        "not run, since sum-1 failed: no such number"
+    }
+    assert totals[-1] == 0
+
+
+def test_what_a_finished_task_frees_runs_before_anything_new() -> None:
+    """One tile's factors before another tile's merge, also of tasks that came while it ran."""
+    tiles = [TileKey(i, 0) for i in range(6)]
+    late = ("cells", "terms", "factors")
+
+    def after(tile: TileKey) -> list[Task]:
+        chain = zip(("merge", *late), late, strict=False)
+        return [Nap(tile, stage, needs=(f"{before}-{tile}",)) for before, stage in chain]
+
+    merges = [Nap(tile, "merge") for tile in tiles]
+    rest = [task for tile in tiles for task in after(tile)]
+    order: list[str] = []
+    execute(
+        planned([Nap(tiles[0])]),
+        None,
+        lambda outcome, *_: order.append(outcome.key),
+        grow=lambda outcome: [*merges, *rest] if outcome.stage == "nap" else (),
+    )
+    stages = [key.split("-")[0] for key in order[1:]]
+    assert stages == ["merge", *late] * len(tiles)
+
+
+def test_what_reads_more_than_was_expected_is_refused_by_name_before_it_runs(
+    tmp_path: Path,
+) -> None:
+    nap = Nap(TileKey(0, 0), notes=str(tmp_path))
+    large = replace(nap, reads={"after": After((), {"bytes": MEMORY})})
+    (outcome,) = execute(planned([large]), None, None)
+    assert outcome.reason.startswith("nap-0_0 needs 1,350 MB and may use 1,000 MB: allow more")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_long_chain_of_refusals_is_no_recursion() -> None:
     chain = [Nap(TileKey(0, 0), notes="/nowhere/at/all", how="bug")]
     chain += [Nap(TileKey(i, 0), needs=(f"nap-{i - 1}_0",)) for i in range(1, 5000)]
-    outcomes = execute(chain, None, None)
+    outcomes = execute(planned(chain), None, None)
     assert sum(outcome.ok for outcome in outcomes) == 0
     assert outcomes[-1].reason.startswith("not run, since nap-0_0 failed: [Errno 2]")
 
@@ -213,8 +252,8 @@ def test_a_killed_worker_is_replaced_and_its_task_done(
 ) -> None:
     naps = [Nap(TileKey(i, 0)) for i in range(20)]
     naps[3] = Nap(TileKey(3, 0), failures=1, how="killed", notes=str(tmp_path))
-    outcomes = execute(naps, workers, None)
-    assert [o.result for o in outcomes] == [f"{i}_0" for i in range(20)]
+    outcomes = execute(planned(naps), workers, None)
+    assert [o.facts["result"] for o in outcomes] == [f"{i}_0" for i in range(20)]
     assert len(list(tmp_path.iterdir())) == 2
 
 
@@ -232,7 +271,8 @@ def test_each_stage_is_one_span_and_keys_name_stage_and_tile(workers: distribute
         time.sleep(0.01)
     scheduler.add_plugin(Keys(), name="keys")
     before = set(scheduler.extensions["spans"].spans)
-    execute([Nap(TileKey(i, -1), s) for s in ("spa", "spb") for i in range(9)], workers, None)
+    naps = [Nap(TileKey(i, -1), stage) for stage in ("spa", "spb") for i in range(9)]
+    execute(planned(naps), workers, None)
     scheduler.remove_plugin("keys")
     spans = scheduler.extensions["spans"].spans
     named = Counter(spans[key].name for key in spans if key not in before)
@@ -246,7 +286,7 @@ def test_a_report_is_kept_and_a_lost_scheduler_does_not_hide_the_reason(
     workers: distributed.Client, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     with report_kept(workers, tmp_path / "dask.html"):
-        execute([Nap(TileKey(0, 0))], workers, None)
+        execute(planned([Nap(TileKey(0, 0))]), workers, None)
     assert "<html" in (tmp_path / "dask.html").read_text()[:200]
     impossible = tmp_path / "dask.html" / "below-a-file.html"
     with pytest.raises(ZeroDivisionError), report_kept(workers, impossible):
@@ -315,15 +355,17 @@ QUIET = """
 import sys
 sys.path.insert(0, {tests!r})
 from elsewhere import scheduler_elsewhere
-from naps import Nap
-from tilestream.dataflow.run import dask_client, execute
+from naps import MEMORY, Nap
+from tilestream.pipeline.engine.cluster import dask_client
+from tilestream.pipeline.engine.executor import execute
+from tilestream.pipeline.engine.plan import Plan
 from tilestream.tiling import TileKey
 
 if __name__ == "__main__":
     naps = [Nap(TileKey(i, 0)) for i in range(3)]
     naps.append(Nap(TileKey(3, 0), how="killed", failures=9, notes=sys.path[1]))
     with dask_client(None, 2, 10**9) as client:
-        outcomes = execute(naps, client, None, retries=1)
+        outcomes = execute(Plan(tuple(naps), MEMORY), client, None, retries=1)
     print(sum(outcome.ok for outcome in outcomes), "of", len(outcomes))
 """
 
@@ -334,7 +376,7 @@ def test_a_scheduler_without_workers_is_given_up() -> None:
         dask_client(address, None, 1) as client,
         pytest.raises(TaskError, match=r"has had no worker for 1 s: start workers"),
     ):
-        execute([Nap(TileKey(0, 0))], client, None, patience=1.0)
+        execute(planned([Nap(TileKey(0, 0))]), client, None, patience=1.0)
 
 
 @pytest.fixture(scope="module")
@@ -361,7 +403,7 @@ def test_a_run_waits_for_what_a_killed_client_left_behind(
     first.wait()
     began = time.time_ns()
     with dask_client(address, None, 1) as client:
-        execute([Nap(TileKey(1, 0), notes=str(notes))], client, None)
+        execute(planned([Nap(TileKey(1, 0), notes=str(notes))]), client, None)
     (left,) = notes.glob("nap-0_0-*")
     (right,) = notes.glob("nap-1_0-*")
     ends = int(left.name.rsplit("-", 1)[1]) + 3 * 10**9
@@ -372,12 +414,14 @@ KILLED = """
 import sys
 sys.path.insert(0, {tests!r})
 from elsewhere import scheduler_elsewhere
-from naps import Nap
-from tilestream.dataflow.run import dask_client, execute
+from naps import MEMORY, Nap
+from tilestream.pipeline.engine.cluster import dask_client
+from tilestream.pipeline.engine.executor import execute
+from tilestream.pipeline.engine.plan import Plan
 from tilestream.tiling import TileKey
 
 with dask_client(sys.argv[1], None, 1) as client:
-    execute([Nap(TileKey(0, 0), after=3.0, notes=sys.argv[2])], client, None)
+    execute(Plan((Nap(TileKey(0, 0), after=3.0, notes=sys.argv[2]),), MEMORY), client, None)
 """
 
 
@@ -388,7 +432,7 @@ def test_the_loss_of_a_scheduler_is_told(
     address, processes = elsewhere
     with dask_client(address, None, 1) as client:
         naps = [Nap(TileKey(i, 0)) for i in range(10)]
-        assert all(outcome.ok for outcome in execute(naps, client, None))
+        assert all(outcome.ok for outcome in execute(planned(naps), client, None))
 
         def kill(outcome: Outcome, ended: int, total: int) -> None:
             if ended == 3:
@@ -396,7 +440,7 @@ def test_the_loss_of_a_scheduler_is_told(
 
         naps = [Nap(TileKey(i, 0), seconds=0.05) for i in range(200)]
         with pytest.raises(TaskError, match=rf"{address} is gone: run the same command again"):
-            execute(naps, client, kill)
+            execute(planned(naps), client, kill)
 
 
 def test_certificates_are_passed_through(tmp_path: Path) -> None:

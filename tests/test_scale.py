@@ -13,7 +13,7 @@ from city_tiles import digest, run_city, write_city, write_drive
 from elsewhere import scheduler_elsewhere
 
 import tilestream as ts
-from tilestream.dataflow.run import dask_client
+from tilestream.pipeline.engine.cluster import dask_client
 
 N, SIZE = 2, 20.0
 
@@ -89,7 +89,7 @@ MEMORY = """
 import sys, time
 sys.path.insert(0, {tests!r})
 from naps import Nap
-from tilestream.dataflow.run import execute
+from tilestream.pipeline.engine.executor import execute
 from tilestream.tiling import TileKey
 
 def resident():

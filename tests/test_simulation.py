@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tilestream.dataflow.simulate import require_space
 from tilestream.errors import (
     CorruptSourceError,
     CrsError,
@@ -15,6 +14,7 @@ from tilestream.errors import (
     SourceNotFoundError,
     UsageError,
 )
+from tilestream.pipeline.jobs.simulate import require_space
 from tilestream.sensors import VLP16
 from tilestream.simulation.footprints import Footprints, read_footprints
 from tilestream.simulation.lidar import measure, turn_of

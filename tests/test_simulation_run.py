@@ -21,11 +21,11 @@ import yaml
 import tilestream as ts
 from tilestream.cli import run
 from tilestream.config import StartSettings
-from tilestream.dataflow import simulate as simulating
-from tilestream.dataflow.plan import BASE_BYTES
-from tilestream.dataflow.simulate import plan_simulation, simulate
 from tilestream.errors import PlanError, UsageError
 from tilestream.formats.mcap import ScanSelection, open_log
+from tilestream.pipeline.engine.stage import BASE_BYTES
+from tilestream.pipeline.jobs import simulate as simulating
+from tilestream.pipeline.jobs.simulate import plan_simulation, simulate
 from tilestream.records import Scan
 from tilestream.simulation.city import City, build_city
 from tilestream.simulation.drive import motion_of, scans, traffic_of
@@ -133,7 +133,7 @@ def test_a_killed_run_goes_on_to_the_same_bytes(
 ) -> None:
     out = tmp_path / "killed"
     code = (
-        "import sys; from tilestream.dataflow.simulate import simulate; "
+        "import sys; from tilestream.pipeline.jobs.simulate import simulate; "
         "from tilestream.simulation.settings import SimulationSettings; "
         "simulate(SimulationSettings.model_validate_json(sys.argv[1]), sys.argv[2])"
     )

@@ -3,7 +3,6 @@
 import json
 import pickle
 import uuid
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +19,8 @@ from tilestream.errors import (
     UsageError,
 )
 from tilestream.formats.pcd import write_pcd
-from tilestream.store import POINTS, Mark, Tile, cells_mark, cells_table, hash_of
+from tilestream.marks import Mark, hash_of, identity_of
+from tilestream.store import POINTS, Tile, cells_table
 from tilestream.tiling import TileKey
 
 
@@ -129,7 +129,7 @@ def test_tables_come_back_with_their_mark(tmp_path: Path, cloud: np.ndarray) -> 
     made = make_store(tmp_path, cloud[:100], tile_size=100.0)
     tile = made.tile(made.keys()[0])
     columns = {"count": np.arange(3), "mean": np.ones((3, 3)), "empty": np.zeros((0, 4))}
-    tile.write_table("cells_1000", columns, Mark("done", inputs="a", facts={"cells": 3}))
+    tile.write_table("cells_1000", columns, Mark("done", identity="a", facts={"cells": 3}))
     read = tile.read_table("cells_1000")
     assert list(read) == list(columns)
     for name, column in columns.items():
@@ -140,17 +140,18 @@ def test_tables_come_back_with_their_mark(tmp_path: Path, cloud: np.ndarray) -> 
         tile.read_table("cells_1000")
 
 
-def test_the_same_work_is_known_by_inputs_settings_and_code() -> None:
-    mark = Mark("done", inputs="a", settings="b")
-    assert mark.same_work(Mark("done", inputs="a", settings="b", facts={"points": 3}))
-    for other in (
-        Mark("done", inputs="x", settings="b"),
-        Mark("done", inputs="a", settings="x"),
-        Mark("done", inputs="a", settings="b", code="0.0.1"),
-        Mark("failed", "why", inputs="a", settings="b"),
-    ):
-        assert not mark.same_work(other)
+def test_the_same_work_is_known_by_its_identity() -> None:
+    assert Mark("done", identity="a", facts={"points": 3}).is_of("a")
+    assert not Mark("done", identity="a").is_of("b")
+    assert not Mark("failed", "why", identity="a").is_of("a")
     assert hash_of("a", 1.5, [2]) == hash_of("a", 1.5, (2,)) != hash_of("a", 1.5, [3])
+    one, rows = ("stage", 1, {"a": 1}, {"b": ["x"]}), np.arange(6)
+    others = [("other", *one[1:]), ("stage", 2, *one[2:]), (*one[:2], {"a": 2}, one[3])]
+    others += [(*one[:3], {"b": ["y"]}), (*one[:2], {"a": rows}, one[3])]
+    others += [(*one[:2], {"a": rows.reshape(2, 3)}, one[3])]
+    assert len({identity_of(*what) for what in (one, *others)}) == 1 + len(others)
+    with pytest.raises(TypeError, match="no canonical form"):
+        hash_of(object())
 
 
 def test_cells_are_read_from_their_table_while_it_is_up_to_date(
@@ -158,14 +159,14 @@ def test_cells_are_read_from_their_table_while_it_is_up_to_date(
 ) -> None:
     tile = make_store(tmp_path, cloud, tile_size=100.0, map_leaf=0.0).tile_at(1.0, 1.0)
     made = tile.cells(2.0)
-    now, name = cells_mark(tile.mark(POINTS), 2000), cells_table(2000)
+    table, key = cells_table(2000), tile.key
+    identity = table.identity(tile.store.grid, key, {key: tile.mark(POINTS).identity})
     columns = {"index": made.index, "count": made.count + 1, "mean": made.mean}
     columns |= {"covariance": made.covariance}
-    tile.write_table(name, columns, now)
+    tile.write_table(table.name, columns, Mark("done", identity=identity))
     np.testing.assert_array_equal(tile.cells(2.0).count, made.count + 1)
-    for out_of_date in ({"inputs": "other points"}, {"settings": "others"}, {"code": "0.0.1"}):
-        tile.write_table(name, columns, replace(now, **out_of_date))
-        np.testing.assert_array_equal(tile.cells(2.0).count, made.count)
+    tile.write_table(table.name, columns, Mark("done", identity="of other points"))
+    np.testing.assert_array_equal(tile.cells(2.0).count, made.count)
 
 
 def test_what_is_no_store_is_refused_by_name(tmp_path: Path) -> None:

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 import tilestream as ts
-from tilestream.dataflow.simulate import simulate
 from tilestream.factors.ghosts import ghosts_among
 from tilestream.factors.observability import box_around, whole_places
 from tilestream.factors.surfels import surfel_mm, surfels_in
 from tilestream.factors.virtual_scan import Scene
 from tilestream.formats.mcap import open_log
 from tilestream.kernels.virtual_scan import cast
+from tilestream.pipeline.jobs.simulate import simulate
 from tilestream.simulation.settings import load_preset
 
 NEAR, REACH = 1_000.0, 76_000.0

@@ -11,10 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 from tilestream.config import RegistrationSettings as RegistrationSettings
 from tilestream.config import StartSettings as StartSettings
-from tilestream.dataflow.along_routes import factors_along as factors_along
-from tilestream.dataflow.along_routes import observe_along as observe_along
-from tilestream.dataflow.ingest_map import ingest as ingest
-from tilestream.dataflow.localize_drive import localize as localize
 from tilestream.factors.observability import observability as observability
 from tilestream.factors.sample_points import sample_points as sample_points
 from tilestream.factors.table import factors as factors
@@ -28,6 +24,10 @@ from tilestream.localization import refined_pose as refined_pose
 from tilestream.localization import register as register
 from tilestream.localization import start_poses as start_poses
 from tilestream.ndt import cells_of as cells_of
+from tilestream.pipeline.jobs.along_routes import factors_along as factors_along
+from tilestream.pipeline.jobs.along_routes import observe_along as observe_along
+from tilestream.pipeline.jobs.ingest import ingest as ingest
+from tilestream.pipeline.jobs.localize import localize as localize
 from tilestream.records import Cells as Cells
 from tilestream.records import LocalizationError as LocalizationError
 from tilestream.records import Registrations as Registrations
@@ -43,9 +43,9 @@ from tilestream.tiling import TileKey as TileKey
 from tilestream.version import VERSION
 
 if TYPE_CHECKING:
-    from tilestream.dataflow.main_job import dataset as dataset
-    from tilestream.dataflow.main_job import run as run
-    from tilestream.dataflow.run_settings import RunSettings as RunSettings
+    from tilestream.pipeline.jobs.run import dataset as dataset
+    from tilestream.pipeline.jobs.run import run as run
+    from tilestream.pipeline.jobs.run_settings import RunSettings as RunSettings
 
 
 def __getattr__(name: str) -> Any:
@@ -53,9 +53,9 @@ def __getattr__(name: str) -> Any:
     cost every worker process 100 MB that its tiles have a use for.
     """
     if name in ("run", "dataset"):
-        return getattr(import_module("tilestream.dataflow.main_job"), name)
+        return getattr(import_module("tilestream.pipeline.jobs.run"), name)
     if name == "RunSettings":
-        return import_module("tilestream.dataflow.run_settings").RunSettings
+        return import_module("tilestream.pipeline.jobs.run_settings").RunSettings
     raise AttributeError(f"module 'tilestream' has no attribute {name!r}")
 
 

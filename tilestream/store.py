@@ -7,17 +7,16 @@ map.zarr/                 attributes: schema, settings, CRS, lattice origin, sou
     cells_2000/...        a table made from them: one array per column
 ```
 
-A table is written by one task: the arrays first, then, last, its mark (status, reason, hashes,
-version). Without a mark a table is missing, whatever lies there; every reader looks at the mark.
+A table is written by one task: the arrays first, then, last, its mark (status, reason, identity,
+facts). Without a mark a table is missing, whatever lies there; every reader looks at the mark.
 """
 
-import hashlib
 import html
 import json
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Container, Iterable, Mapping
+from dataclasses import asdict, dataclass
 from functools import cached_property
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import fsspec
 import numpy as np
@@ -32,13 +31,14 @@ from tilestream.errors import (
     TileNotReadyError,
     UsageError,
 )
+from tilestream.marks import MISSING, Mark, hash_of, identity_of
 from tilestream.ndt import cells_of_mm
 from tilestream.records import Cells, Float64, Int64
 from tilestream.tiling import MM_PER_M, Box, TileGrid, TileKey, whole_mm
 from tilestream.version import VERSION
 
-SCHEMA = 1
-"""Version of the store's layout; a store with a larger one is refused."""
+SCHEMA = 2
+"""Version of the store's layout; a store with another one is refused."""
 POINTS = "points"
 """Name of the table that ingest writes: the column `xyz`."""
 CELLS_VERSION = 1
@@ -46,43 +46,52 @@ CELLS_VERSION = 1
 _CODEC = BloscCodec(cname="zstd", clevel=3, shuffle="bitshuffle")
 _OURS = "tilestream"
 
-Status = Literal["missing", "done", "failed", "skipped"]
-
 
 @dataclass(frozen=True)
-class Mark:
-    """What became of a table of a tile; written last, checked by every reader."""
+class TileTable:
+    """A table that every tile can have, made from the map within reach of the tile."""
 
-    status: Status
-    """`done`: whole. `failed` or `skipped`: not there, and `reason` says why."""
-    reason: str = ""
-    """Why it failed or was skipped."""
-    inputs: str = ""
-    """Hash of what it was made from."""
-    settings: str = ""
-    """Hash of the settings it was made with."""
-    code: str = VERSION
-    """Version of the code that made it."""
-    facts: dict[str, Any] = field(default_factory=dict)
-    """Small numbers that a listing shows without reading the table: counts, extents."""
+    name: str
+    """Name of the table in a tile, e.g. `cells_2000`."""
+    stage: str
+    """Name of the stage that makes it."""
+    version: int
+    """Version of that stage."""
+    takes: Mapping[str, Any]
+    """The settings of the stage."""
+    reach_mm: int
+    """How far around the tile the map decides the table [mm]."""
+    make: Callable[["TileStore", TileKey], dict[str, NDArray[Any]]]
+    """Makes the columns."""
+    reads: "TileTable | None" = None
+    """The table of the tiles in reach that it is made from; None: their points."""
 
     @property
-    def identity(self) -> str:
-        """Hash of everything the table depends on: what a table made from it has as input."""
-        return hash_of(self.inputs, self.settings, self.code)
+    def points_reach_mm(self) -> int:
+        """How far around the tile points decide it, through all that it is made from [mm]."""
+        return self.reach_mm + (0 if self.reads is None else self.reads.points_reach_mm)
 
-    def same_work(self, other: "Mark") -> bool:
-        """Whether both say: done, from the same inputs, settings and code."""
-        return self.status == other.status == "done" and self.identity == other.identity
+    def tiles(self, grid: TileGrid, key: TileKey, have: Container[TileKey]) -> list[TileKey]:
+        """The tiles in reach of one that the map has, sorted."""
+        near = grid.keys_over(grid.core(key).grown(self.reach_mm))
+        return [k for k in near if k in have]
 
+    def identity(self, grid: TileGrid, key: TileKey, have: Mapping[TileKey, str]) -> str:
+        """The identity that the table of a tile has, or will have.
 
-MISSING = Mark(status="missing", reason="not written yet", code="")
-
-
-def hash_of(*values: Any) -> str:
-    """Hex digest (128 bit) of values that JSON can hold, the same on every machine."""
-    text = json.dumps(values, sort_keys=True, separators=(",", ":"))
-    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+        Args:
+            grid: the tiles.
+            key: the tile.
+            have: the identity of the points of each tile of the map, at least of those in reach.
+        """
+        near = self.tiles(grid, key, have)
+        below = self.reads
+        if below is None:
+            inputs = [(str(k), have[k]) for k in near]
+        else:
+            inputs = [(str(k), below.identity(grid, k, have)) for k in near]
+        takes = {**self.takes, "tile": key}
+        return identity_of(self.stage, self.version, takes, {"map_part": [hash_of(inputs)]})
 
 
 @dataclass(frozen=True)
@@ -127,17 +136,8 @@ class Tile:
         """The same points as (n, 3) int64 whole millimetres in the map frame."""
         if not halo:
             return self._core_mm()
-        box = self.store.grid.halo_box(self.key)
-        parts = []
-        for key in self.store.grid.keys_over(box):
-            tile = Tile(self.store, key)
-            if key != self.key and tile.mark(POINTS).status == "missing":
-                continue
-            points = tile._core_mm()
-            x, y = points[:, 0], points[:, 1]
-            inside = (x >= box.x_lo) & (x < box.x_hi) & (y >= box.y_lo) & (y < box.y_hi)
-            parts.append(points if key == self.key else points[inside])
-        return np.concatenate(parts)
+        self.require(POINTS)
+        return self.store.points_in(self.store.grid.halo_box(self.key))
 
     def _core_mm(self) -> Int64:
         xyz = self.read_table(POINTS)["xyz"]
@@ -156,10 +156,23 @@ class Tile:
         """
         cell_mm = whole_mm(cell_size, "cell_size")
         self.store.grid.require_cell_size(cell_mm)
-        name = cells_table(cell_mm)
-        if self.mark(name).same_work(cells_mark(self.mark(POINTS), cell_mm)):
-            return Cells(**self.read_table(name), cell_size=cell_size)
-        return cells_of_mm(self.points_mm(), cell_mm)
+        return Cells(**self.derived(cells_table(cell_mm)), cell_size=cell_size)
+
+    def derived(self, table: TileTable) -> dict[str, NDArray[Any]]:
+        """The columns of a table that is made from the map: as stored where it is up to date, else
+        made now.
+
+        Raises:
+            TileNotReadyError: the tile, or one in reach that exists, is not done; says why.
+        """
+        grid = self.store.grid
+        near = list(grid.keys_over(grid.core(self.key).grown(table.points_reach_mm)))
+        marks = self.store._marks([*((k, POINTS) for k in near), (self.key, table.name)])
+        *points, mark = marks
+        have = {k: m.identity for k, m in zip(near, points, strict=True) if m.status == "done"}
+        if mark.is_of(table.identity(grid, self.key, have)):
+            return self.read_table(table.name)
+        return table.make(self.store, self.key)
 
     def mark(self, table: str) -> Mark:
         """What became of a table; `missing` where there is none."""
@@ -295,15 +308,18 @@ class TileStore:
             store.grid.require_cell_size(whole_mm(settings.map_leaf, "map_leaf"))
         if store.fs.exists(store.root) and store.fs.ls(store.root, detail=False):
             raise StoreError(f"{url} is there and is no tile store: choose another path")
-        zarr.open_group(url, mode="w", attributes={_OURS: store._attributes(sources=[])})
+        zarr.open_group(url, mode="w", attributes={_OURS: store._attributes([], {})})
         return store
 
-    def _attributes(self, sources: list[dict[str, Any]]) -> dict[str, Any]:
+    def _attributes(
+        self, sources: list[dict[str, Any]], made_by: Mapping[str, int]
+    ) -> dict[str, Any]:
         return {
             "schema": SCHEMA,
             "lattice_origin": [0.0, 0.0, 0.0],
             "settings": asdict(self.settings),
             "sources": sources,
+            "made_by": dict(made_by),
         }
 
     def sources(self) -> list[dict[str, Any]]:
@@ -314,9 +330,17 @@ class TileStore:
         found: list[dict[str, Any]] = _root_attributes(self.fs, self.root, self.url)["sources"]
         return found
 
-    def write_sources(self, sources: list[dict[str, Any]]) -> None:
-        """Record what the map was made from; the one writer is the process that ran the ingest."""
-        zarr.open_group(self._zarr, mode="r+").attrs[_OURS] = self._attributes(sources)
+    def made_by(self) -> dict[str, int]:
+        """The stages that made the map, with their versions; empty until an ingest has ended."""
+        found: dict[str, int] = _root_attributes(self.fs, self.root, self.url)["made_by"]
+        return found
+
+    def write_sources(self, sources: list[dict[str, Any]], made_by: Mapping[str, int]) -> None:
+        """Record what the map was made from, and by which versions of the stages.
+
+        The one writer is the process that ran the ingest.
+        """
+        zarr.open_group(self._zarr, mode="r+").attrs[_OURS] = self._attributes(sources, made_by)
 
     def remove(self, key: TileKey) -> None:
         """Remove a tile with all its tables; the mark of its points goes first."""
@@ -332,10 +356,12 @@ class TileStore:
         """The tiles of which a table is done, sorted."""
         return [key for key, mark in self.marks(table).items() if mark.status == "done"]
 
-    def marks(self, table: str = POINTS) -> dict[TileKey, Mark]:
-        """What became of a table in every tile of the store, sorted by tile."""
-        keys = sorted(self._tile_folders())
-        return dict(zip(keys, self._marks([(key, table) for key in keys]), strict=True))
+    def marks(
+        self, table: str = POINTS, keys: Iterable[TileKey] | None = None
+    ) -> dict[TileKey, Mark]:
+        """What became of a table in some tiles, in their order; None: in every tile, sorted."""
+        wanted = sorted(self._tile_folders()) if keys is None else list(keys)
+        return dict(zip(wanted, self._marks([(key, table) for key in wanted]), strict=True))
 
     def identities(self) -> dict[TileKey, str]:
         """The identity of the points of each tile that is done: what tables are made from."""
@@ -384,8 +410,7 @@ class TileStore:
         """
         cell_mm = whole_mm(cell_size, "cell_size")
         self.grid.require_cell_size(cell_mm)
-        tiles = [Tile(self, key) for key in self.grid.keys_over(box)]
-        parts = [tile.cells(cell_size) for tile in tiles if tile.mark(POINTS).status != "missing"]
+        parts = [tile.cells(cell_size) for tile in self.tiles_over(box)]
         return Cells(
             np.concatenate([np.zeros((0, 3), np.int64), *(part.index for part in parts)]),
             np.concatenate([np.zeros(0, np.int64), *(part.count for part in parts)]),
@@ -393,6 +418,28 @@ class TileStore:
             np.concatenate([np.zeros((0, 3, 3)), *(part.covariance for part in parts)]),
             cell_size,
         )
+
+    def points_in(self, box: Box) -> Int64:
+        """(n, 3) the map points in a box [mm, map frame]; tiles that do not exist have none.
+
+        Raises:
+            TileNotReadyError: a tile in the box failed or was skipped; says why.
+        """
+        parts = [np.zeros((0, 3), np.int64)]
+        for tile in self.tiles_over(box):
+            points = tile.points_mm()
+            parts.append(points[box.holds(points)])
+        return np.concatenate(parts)
+
+    def tiles_over(self, box: Box) -> list[Tile]:
+        """The tiles that a box touches and that exist, done or not."""
+        keys = list(self.grid.keys_over(box))
+        marks = self._marks([(key, POINTS) for key in keys])
+        return [
+            Tile(self, key)
+            for key, mark in zip(keys, marks, strict=True)
+            if mark.status != "missing"
+        ]
 
     def __repr__(self) -> str:
         counts = [m.facts["points"] for m in self.marks().values() if m.status == "done"]
@@ -413,14 +460,22 @@ class TileStore:
         return f"<p>{html.escape(repr(self))}</p><table>{head}{body}</table>{more}"
 
 
-def cells_table(cell_mm: int) -> str:
-    """Name of the table of cells of one size, e.g. `cells_2000` for 2 m."""
-    return f"cells_{cell_mm}"
+def cells_table(cell_mm: int) -> TileTable:
+    """The cells of one size: the columns of `Cells`."""
+    return TileTable(
+        name=f"cells_{cell_mm}",
+        stage="cells",
+        version=CELLS_VERSION,
+        takes={"cell_mm": cell_mm},
+        reach_mm=0,
+        make=lambda store, key: _cell_columns(store, key, cell_mm),
+    )
 
 
-def cells_mark(points: Mark, cell_mm: int) -> Mark:
-    """The mark of the cells of one size, made from a tile's points by this code."""
-    return Mark("done", inputs=points.identity, settings=hash_of(cell_mm, CELLS_VERSION))
+def _cell_columns(store: TileStore, key: TileKey, cell_mm: int) -> dict[str, NDArray[Any]]:
+    cells = cells_of_mm(store.tile(key).points_mm(), cell_mm)
+    columns = ("index", "count", "mean", "covariance")
+    return {name: getattr(cells, name) for name in columns}
 
 
 def open_store(url: str) -> TileStore:
@@ -456,10 +511,11 @@ def _root_attributes(fs: Any, root: str, url: str) -> dict[str, Any]:
         schema = int(attributes["schema"])
     except (ValueError, KeyError, TypeError) as error:
         raise StoreError(f"{url} is a Zarr group but no tile store of tilestream") from error
-    if schema > SCHEMA:
+    if schema != SCHEMA:
+        what = "install the newer tilestream" if schema > SCHEMA else "give another path"
         raise StoreVersionError(
             f"{url} has schema {schema}, this is tilestream {VERSION} with schema {SCHEMA}: "
-            "install the newer tilestream, or ingest the sources again"
+            f"{what}, or remove it and ingest the sources again"
         )
     return attributes
 

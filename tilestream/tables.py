@@ -3,8 +3,8 @@
 import io
 import json
 import uuid
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import asdict
 
 import fsspec
 import pandas as pd
@@ -12,21 +12,20 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from tilestream.errors import CorruptSourceError, SourceNotFoundError, UsageError
+from tilestream.marks import MISSING, Mark
 from tilestream.records import Column
 
 _MARK = b"tilestream"
 
 
-def write_table(
-    path: str, frame: pd.DataFrame, columns: Sequence[Column], mark: Mapping[str, Any]
-) -> None:
+def write_table(path: str, frame: pd.DataFrame, columns: Sequence[Column], mark: Mark) -> None:
     """Write a table in one piece: a file that is there is whole.
 
     Args:
         path: where to, a local path or any fsspec URL; a file there is replaced.
         frame: the rows.
         columns: what the columns mean; each of the frame's columns must be among them.
-        mark: small JSON facts kept in the file: identity, settings, version.
+        mark: what is kept in the file of how it was made; `read_mark` gives it back.
     """
     known = {column.name: column for column in columns}
     table = pa.Table.from_pandas(frame, preserve_index=False)
@@ -40,7 +39,7 @@ def write_table(
         )
         for field in table.schema
     ]
-    table = table.cast(pa.schema(fields, {_MARK: json.dumps(mark, sort_keys=True)}))
+    table = table.cast(pa.schema(fields, {_MARK: json.dumps(asdict(mark), sort_keys=True)}))
     buffer = io.BytesIO()
     pq.write_table(table, buffer, compression="zstd")
     fs, place = fsspec.core.url_to_fs(path)
@@ -55,21 +54,15 @@ def write_table(
         raise
 
 
-def read_mark(path: str) -> dict[str, Any] | None:
-    """The mark of a table; None where there is no whole table at `path`."""
+def read_mark(path: str) -> Mark:
+    """The mark of a table; `missing` where there is no whole table of ours at `path`."""
     fs, place = fsspec.core.url_to_fs(path)
     try:
         with fs.open(place, "rb") as file:
             metadata = pq.read_schema(file).metadata or {}
     except (FileNotFoundError, pa.ArrowInvalid):
-        return None
-    return dict(json.loads(metadata[_MARK])) if _MARK in metadata else None
-
-
-def is_done(path: str, identity: str) -> bool:
-    """Whether a whole table is at `path` that was made from the same."""
-    mark = read_mark(path)
-    return mark is not None and mark["identity"] == identity
+        return MISSING
+    return Mark(**json.loads(metadata[_MARK])) if _MARK in metadata else MISSING
 
 
 def remove_others(keep: Sequence[str]) -> None:

@@ -9,6 +9,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple, Self
 
+import numpy as np
+from numpy.typing import NDArray
+
 from tilestream.errors import UsageError
 
 MM_PER_M = 1000
@@ -75,6 +78,23 @@ class Box:
     y_lo: int
     x_hi: int
     y_hi: int
+
+    @classmethod
+    def around(cls, places: NDArray[np.float64], reach: float) -> Self:
+        """The smallest box with all (k, 2 or 3) places and `reach` metres around each, rim included
+        [m].
+        """
+        low = np.floor((places[:, :2].min(axis=0) - reach) * MM_PER_M).astype(int)
+        high = np.ceil((places[:, :2].max(axis=0) + reach) * MM_PER_M).astype(int) + 1
+        return cls(*low.tolist(), *high.tolist())
+
+    def holds(self, points_mm: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """(n,) which of the (n, 2 or 3) points lie in it [mm]."""
+        x, y = points_mm[:, 0], points_mm[:, 1]
+        inside: NDArray[np.bool_] = (
+            (x >= self.x_lo) & (x < self.x_hi) & (y >= self.y_lo) & (y < self.y_hi)
+        )
+        return inside
 
     def grown(self, margin_mm: int) -> "Box":
         """The box with `margin_mm` added on each side."""

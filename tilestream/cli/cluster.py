@@ -11,9 +11,9 @@ from typing import Annotated, Any
 import typer
 
 from tilestream.cli.printing import err, say
-from tilestream.dataflow.run import LOOPBACK, TlsFiles, dask_client
-from tilestream.dataflow.telling import page_url
 from tilestream.errors import UsageError
+from tilestream.pipeline.engine.cluster import LOOPBACK, TlsFiles, dask_client
+from tilestream.pipeline.engine.events import page_url
 
 WORKERS = "Worker processes on this machine; 1: this process does all."
 AllCores = Annotated[int | None, typer.Option(min=1, help=WORKERS, show_default="one per core")]

@@ -13,11 +13,11 @@ from tilestream.cli.options import AsJson, Changes, Config, DryRun
 from tilestream.cli.printing import err, out, print_json, say
 from tilestream.cli.progress import progress
 from tilestream.cli.tables import forecast_rows, forecast_table, plan_table, report_table
-from tilestream.dataflow import main_job
-from tilestream.dataflow import simulate as simulation
-from tilestream.dataflow.main_forecast import forecast
-from tilestream.dataflow.run_settings import RunSettings, read_settings
 from tilestream.errors import LimitError
+from tilestream.pipeline.jobs import run as main_job
+from tilestream.pipeline.jobs import simulate as simulation
+from tilestream.pipeline.jobs.forecast import forecast
+from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
 from tilestream.report import cards, gate
 from tilestream.report.judgement import MISSING, check_threshold
 from tilestream.simulation.settings import load_preset

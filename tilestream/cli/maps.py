@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from tilestream.apps import diff as map_diff
 from tilestream.cli.cluster import HERE, Cluster, on_cluster
 from tilestream.cli.options import (
     AsJson,
@@ -23,10 +24,10 @@ from tilestream.cli.printing import out, print_json, say
 from tilestream.cli.progress import progress
 from tilestream.cli.tables import TILE_CHANGES, diff_table, info_table, plan_table, tile_table
 from tilestream.config import IngestSettings
-from tilestream.dataflow import ingest_map, map_diff
 from tilestream.errors import PartialError
 from tilestream.formats import describe
 from tilestream.formats.mcap import ScanSelection
+from tilestream.pipeline.jobs import ingest as ingest_map
 from tilestream.store import POINTS, TileStore, open_store
 
 

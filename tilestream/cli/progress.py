@@ -19,8 +19,8 @@ from rich.progress import (
 from rich.text import Text
 
 from tilestream.cli.printing import err, say
-from tilestream.dataflow.run import Watch
-from tilestream.dataflow.tasks import Outcome
+from tilestream.pipeline.engine.attempt import Outcome
+from tilestream.pipeline.engine.executor import Watch
 
 LINE_EVERY = 30.0
 """How often progress is told where there is no terminal, as in the log of a cluster job [s]."""

@@ -5,6 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
+from tilestream.apps import compare as comparing
 from tilestream.cli.cluster import HERE, Cluster, on_cluster
 from tilestream.cli.options import (
     AsJson,
@@ -39,15 +40,16 @@ from tilestream.cli.tables import (
     plan_table,
 )
 from tilestream.config import StartSettings
-from tilestream.dataflow import along_routes, localize_drive
-from tilestream.dataflow import compare as comparing
-from tilestream.dataflow.factors_tasks import Looking
-from tilestream.dataflow.localize_tasks import Reading
 from tilestream.errors import PartialError
 from tilestream.factors.catalogue import Which
 from tilestream.factors.rows import samples_by_tile
 from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.formats.mcap import ScanSelection
+from tilestream.pipeline.jobs import along_routes
+from tilestream.pipeline.jobs import localize as localize_drive
+from tilestream.pipeline.stages.drive_scans import Reading
+from tilestream.pipeline.stages.factors import Looking
+from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.records import TruePose
 from tilestream.report.comparison_page import write_comparison
 from tilestream.report.judgement import check_threshold
@@ -107,7 +109,11 @@ def localize(
     )
     opened = open_store(store)
     if dry_run:
-        out.print(plan_table(localize_drive.plan_localize(opened, reading, folder, **how)))
+        out.print(
+            plan_table(
+                localize_drive.plan_localize(MapPlan.of_store(opened), reading, folder, **how)
+            )
+        )
         return
     with cluster.client(allowed) as client, progress() as watch:
         labels = localize_drive.localize(
@@ -148,7 +154,9 @@ def factors(
     if dry_run:
         looking = Looking(seen_by, cell_size, which, sensor_height)
         samples = samples_by_tile(opened.grid, routes, spacing)
-        plan = along_routes.plan_factors(opened, samples, folder, looking, allowed)
+        plan = along_routes.plan_factors(
+            MapPlan.of_store(opened), samples, folder, looking, allowed
+        )
         out.print(plan_table(plan))
         return
     with cluster.client(allowed) as client, progress() as watch:

@@ -8,12 +8,12 @@ import pandas as pd
 from rich.box import SIMPLE
 from rich.table import Table
 
-from tilestream.dataflow.calibration import core_hours
-from tilestream.dataflow.main_forecast import Forecast
-from tilestream.dataflow.map_diff import MapDiff
-from tilestream.dataflow.plan import Plan, megabytes
+from tilestream.apps.diff import MapDiff
 from tilestream.factors.catalogue import COLUMNS
 from tilestream.formats.base import SourceInfo
+from tilestream.pipeline.engine.costs import core_hours
+from tilestream.pipeline.engine.plan import Plan, megabytes
+from tilestream.pipeline.jobs.forecast import Forecast
 from tilestream.store import POINTS, TileStore
 
 

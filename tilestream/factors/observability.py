@@ -177,8 +177,8 @@ class _View:
         """What of the map can be seen from the places, the ghosts, and the cells around that."""
         reach, edge_mm = self.beams.range_max, surfel_mm(self.store)
         rim = 1.0 + REACH_EDGES * edge_mm / MM_PER_M
-        surfels = surfels_in(self.store, box_around(places, reach + rim))
-        cells = self.store.cells_in(box_around(places, reach + MARGIN), self.cell_size)
+        surfels = surfels_in(self.store, Box.around(places, reach + rim))
+        cells = self.store.cells_in(Box.around(places, reach + MARGIN), self.cell_size)
         ghost = np.zeros(len(surfels), np.bool_)
         if self.seeing.without_ghosts:
             ghost = ghosts_among(surfels, edge_mm)
@@ -375,13 +375,6 @@ def blocks_of(places: Float64, some: Int64) -> Iterator[Int64]:
     blocks = np.floor(places[some, :2] / BLOCK).astype(np.int64)
     for block in np.unique(blocks, axis=0):
         yield some[(blocks == block).all(axis=1)]
-
-
-def box_around(places: Float64, reach: float) -> Box:
-    """The box that holds everything within `reach` [m] of (k, 3) places."""
-    low = np.floor((places[:, :2].min(axis=0) - reach) * MM_PER_M)
-    high = np.ceil((places[:, :2].max(axis=0) + reach) * MM_PER_M)
-    return Box(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
 
 
 def whole_places(places: Float64) -> Int64:

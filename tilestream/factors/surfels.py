@@ -4,7 +4,6 @@ One per voxel of 0.2 m that holds map points (a coarser map: per voxel of its le
 the points around it as a small disc, or a ball where they make no plane.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -15,7 +14,7 @@ from tilestream.kernels.cells import cell_sums
 from tilestream.kernels.depth_image import thin
 from tilestream.kernels.surfels import surfels_of
 from tilestream.records import Int64
-from tilestream.store import MISSING, POINTS, Mark, Tile, TileStore, hash_of
+from tilestream.store import Tile, TileStore, TileTable
 from tilestream.tiling import Box, TileKey, whole_mm
 
 SURFELS_VERSION = 1
@@ -50,36 +49,16 @@ def surfel_mm(store: TileStore) -> int:
     return max(FINEST_MM, whole_mm(store.settings.map_leaf, "map_leaf"))
 
 
-def surfels_table(edge_mm: int) -> str:
-    """Name of the table of surfels, e.g. `surfels_200`."""
-    return f"surfels_{edge_mm}"
-
-
-def around_tile(store: TileStore, key: TileKey) -> Box:
-    """The box of all points that the surfels of a tile depend on."""
-    return store.grid.core(key).grown(REACH_EDGES * surfel_mm(store))
-
-
-def surfels_inputs(
-    store: TileStore, key: TileKey, have: Mapping[TileKey, str] | None = None
-) -> str:
-    """Hash of all that the surfels of a tile are made from: the points of the tiles in reach.
-
-    Args:
-        store: the map.
-        key: the tile.
-        have: the identity of the points of each tile of the map; None: as the store has them.
-    """
-    keys = list(store.grid.keys_over(around_tile(store, key)))
-    if have is not None:
-        return hash_of([(str(near), have.get(near, MISSING.identity)) for near in keys])
-    return hash_of([(str(near), Tile(store, near).mark(POINTS).identity) for near in keys])
-
-
-def surfels_mark(store: TileStore, key: TileKey) -> Mark:
-    """The mark of the surfels that are made from the store's points by this code."""
-    settings = hash_of(surfel_mm(store), SURFELS_VERSION)
-    return Mark("done", inputs=surfels_inputs(store, key), settings=settings)
+def surfels_table(edge_mm: int) -> TileTable:
+    """The surfels of voxels of one edge, small numbers: `centre` from the tile's origin."""
+    return TileTable(
+        name=f"surfels_{edge_mm}",
+        stage="surfels",
+        version=SURFELS_VERSION,
+        takes={"edge_mm": edge_mm},
+        reach_mm=REACH_EDGES * edge_mm,
+        make=lambda store, key: _columns(store, key, tile_surfels(store, key)),
+    )
 
 
 def tile_surfels(store: TileStore, key: TileKey) -> Surfels:
@@ -89,14 +68,14 @@ def tile_surfels(store: TileStore, key: TileKey) -> Surfels:
         TileNotReadyError: the tile, or a neighbour that exists, is not done; says why.
     """
     edge = surfel_mm(store)
-    points = points_in(store, around_tile(store, key), key)
+    store.tile(key)  # which must be there, unlike its neighbours
+    points = store.points_in(store.grid.core(key).grown(REACH_EDGES * edge))
     index, sums = cell_sums(points, edge)
     low, core = index * edge, store.grid.core(key)
-    return Surfels(*surfels_of(thin(index, sums, edge), index, edge, _inside(low, core)))
+    return Surfels(*surfels_of(thin(index, sums, edge), index, edge, core.holds(low)))
 
 
-def surfel_columns(store: TileStore, key: TileKey, surfels: Surfels) -> dict[str, NDArray[Any]]:
-    """What the store keeps of a tile's surfels: an array per column, small numbers."""
+def _columns(store: TileStore, key: TileKey, surfels: Surfels) -> dict[str, NDArray[Any]]:
     origin = np.array(store.grid.origin_mm(key), np.int64)
     return {
         "centre": np.ascontiguousarray((surfels.centre_mm - origin).T.astype(np.int32)),
@@ -105,17 +84,10 @@ def surfel_columns(store: TileStore, key: TileKey, surfels: Surfels) -> dict[str
     }
 
 
-def read_surfels(store: TileStore, key: TileKey) -> Surfels:
-    """The surfels of a tile: from their table where it is up to date, else made now.
-
-    Raises:
-        TileNotReadyError: as `tile_surfels`.
-    """
-    tile, name = Tile(store, key), surfels_table(surfel_mm(store))
-    if not tile.mark(name).same_work(surfels_mark(store, key)):
-        return tile_surfels(store, key)
-    kept = tile.read_table(name)
-    origin = np.array(store.grid.origin_mm(key), np.int64)
+def _surfels(tile: Tile) -> Surfels:
+    """The surfels of a tile; raises as `tile_surfels`."""
+    kept = tile.derived(surfels_table(surfel_mm(tile.store)))
+    origin = np.array(tile.store.grid.origin_mm(tile.key), np.int64)
     return Surfels(
         kept["centre"].T.astype(np.int64) + origin,
         np.ascontiguousarray(kept["normal"].T),
@@ -130,10 +102,9 @@ def surfels_in(store: TileStore, box: Box) -> Surfels:
         TileNotReadyError: a tile in reach failed or was skipped; says why.
     """
     parts = [_NONE]
-    for key in store.grid.keys_over(box):
-        if Tile(store, key).mark(POINTS).status != "missing":
-            found = read_surfels(store, key)
-            parts.append(found.where(_inside(found.centre_mm, box)))
+    for tile in store.tiles_over(box):
+        found = _surfels(tile)
+        parts.append(found.where(box.holds(found.centre_mm)))
     return Surfels(
         np.concatenate([part.centre_mm for part in parts]),
         np.concatenate([part.normal for part in parts]),
@@ -141,29 +112,4 @@ def surfels_in(store: TileStore, box: Box) -> Surfels:
     )
 
 
-def points_in(store: TileStore, box: Box, key: TileKey | None = None) -> Int64:
-    """(n, 3) the map points in a box [mm].
-
-    Args:
-        store: the map.
-        box: where; tiles that the store does not have are empty ground …
-        key: … but for this one, which must be there.
-
-    Raises:
-        TileNotReadyError: a tile in the box failed or was skipped; says why.
-    """
-    parts = [np.zeros((0, 3), np.int64)]
-    for near in store.grid.keys_over(box):
-        if near == key or Tile(store, near).mark(POINTS).status != "missing":
-            points = store.tile(near).points_mm()
-            parts.append(points[_inside(points, box)])
-    return np.concatenate(parts)
-
-
 _NONE = Surfels(np.zeros((0, 3), np.int64), np.zeros((0, 3), np.int16), np.zeros(0, np.int32))
-
-
-def _inside(points_mm: Int64, box: Box) -> NDArray[np.bool_]:
-    x, y = points_mm[:, 0], points_mm[:, 1]
-    inside: NDArray[np.bool_] = (x >= box.x_lo) & (x < box.x_hi) & (y >= box.y_lo) & (y < box.y_hi)
-    return inside

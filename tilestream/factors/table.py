@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from tilestream.errors import TileNotReadyError, UsageError
 from tilestream.factors.catalogue import COUNTS, CRITERIA, Which, columns_of
-from tilestream.factors.terms import terms_mark, terms_table, tile_terms
+from tilestream.factors.terms import terms_table
 from tilestream.factors.vicinity import TileTerms, vicinity_sums
 from tilestream.records import Float64, Int64
 from tilestream.sensors import VLP16, Sensor
@@ -88,18 +88,13 @@ class TermsCache:
         tile = Tile(self.store, key)
         if tile.mark(POINTS).status == "missing":
             return None
-        cell_mm = whole_mm(self.cell_size, "cell_size")
-        name = terms_table(cell_mm)
-        if tile.mark(name).same_work(terms_mark(self.store, key, cell_mm)):
-            return TileTerms.from_arrays(tile.read_table(name))
-        return tile_terms(self.store, key, self.cell_size)
+        table = terms_table(whole_mm(self.cell_size, "cell_size"))
+        return TileTerms.from_arrays(tile.derived(table))
 
     def around(self, places: Float64, reach: float) -> Iterator[TileTerms]:
         """The terms of all tiles within `reach` [m] of the places, the nearest first."""
         low, high = places[:, :2].min(axis=0), places[:, :2].max(axis=0)
-        x_lo, y_lo = (int(v) for v in np.floor((low - reach) * MM_PER_M))
-        x_hi, y_hi = (int(v) for v in np.ceil((high + reach) * MM_PER_M))
-        keys = self.store.grid.keys_over(Box(x_lo, y_lo, x_hi + 1, y_hi + 1))
+        keys = self.store.grid.keys_over(Box.around(places, reach))
         middle = (low + high) / 2.0 * MM_PER_M / self.store.grid.tile_mm - 0.5
         for key in sorted(keys, key=lambda k: (float(np.hypot(*(np.array(k) - middle))), k)):
             terms = self.get(key)

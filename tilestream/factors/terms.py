@@ -4,8 +4,6 @@ A cell's neighbours are those of the whole map (definitions, section 2), so the 
 around the tile take part; what is kept is the tile's own.
 """
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from tilestream.factors.catalogue import CRITERIA
@@ -14,10 +12,10 @@ from tilestream.kernels.cells import cell_of_points, cell_sums, moments
 from tilestream.kernels.depth_image import thin
 from tilestream.ndt import MIN_POINTS
 from tilestream.records import Cells, Int64
-from tilestream.store import MISSING, POINTS, Mark, Tile, TileStore, hash_of
-from tilestream.tiling import Box, TileKey, whole_mm
+from tilestream.store import POINTS, Tile, TileStore, TileTable, cells_table
+from tilestream.tiling import MM_PER_M, Box, TileKey, whole_mm
 
-TERMS_VERSION = 1
+TERMS_VERSION = 2
 """Raise it when the terms that are made from the same points change."""
 DEPTH_MM = 500
 """Edge of the voxels to which map points are thinned for the depth image [mm]."""
@@ -25,11 +23,6 @@ REACH_MM = 10_000
 """How far the terms of a cell look [mm]: its neighbours' neighbours, 5 m and 5 m."""
 SHIFT_MM = 3_000
 """How far the 441 shifts carry a point, sqrt(8) m [mm], rounded up."""
-
-
-def terms_table(cell_mm: int) -> str:
-    """Name of the table of terms of cells of one size, e.g. `terms_2000` for 2 m."""
-    return f"terms_{cell_mm}"
 
 
 def reach_mm(cell_mm: int) -> int:
@@ -41,28 +34,17 @@ def reach_mm(cell_mm: int) -> int:
     return max(REACH_MM, 2 * cell_mm, SHIFT_MM + cell_mm)
 
 
-def terms_inputs(
-    store: TileStore, key: TileKey, cell_mm: int, have: Mapping[TileKey, str] | None = None
-) -> str:
-    """Hash of all that the terms of a tile are made from: the points of the tiles in reach.
-
-    Args:
-        store: the map.
-        key: the tile.
-        cell_mm: edge of a cell [mm].
-        have: the identity of the points of each tile of the map; None: as the store has them.
-    """
-    box = store.grid.core(key).grown(reach_mm(cell_mm))
-    keys = list(store.grid.keys_over(box))
-    if have is not None:
-        return hash_of([(str(near), have.get(near, MISSING.identity)) for near in keys])
-    return hash_of([(str(near), Tile(store, near).mark(POINTS).identity) for near in keys])
-
-
-def terms_mark(store: TileStore, key: TileKey, cell_mm: int) -> Mark:
-    """The mark of the terms that are made from the store's points by this code."""
-    inputs = terms_inputs(store, key, cell_mm)
-    return Mark("done", inputs=inputs, settings=hash_of(cell_mm, TERMS_VERSION))
+def terms_table(cell_mm: int) -> TileTable:
+    """The terms of cells of one size: the columns of `TileTerms.arrays`."""
+    return TileTable(
+        name=f"terms_{cell_mm}",
+        stage="terms",
+        version=TERMS_VERSION,
+        takes={"cell_mm": cell_mm},
+        reach_mm=reach_mm(cell_mm),
+        make=lambda store, key: tile_terms(store, key, cell_mm / MM_PER_M).arrays(),
+        reads=cells_table(cell_mm),
+    )
 
 
 def terms_of(cells: Cells, points_mm: Int64, core: Box, depth_mm: Int64 | None = None) -> TileTerms:

@@ -1,0 +1,282 @@
+"""The job that compares: which lidar, which range, which map resolution suffices along a route.
+
+All choices are one plan, observed side by side: what two of them need of the map is made once.
+"""
+
+import itertools
+import math
+import os
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import pandas as pd
+
+from tilestream.config import RegistrationSettings
+from tilestream.errors import PartialError, UsageError
+from tilestream.factors.rows import in_route_order, samples_by_tile
+from tilestream.factors.virtual_scan import VirtualSettings
+from tilestream.pipeline.engine.executor import Watch, execute
+from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, paths_of
+from tilestream.pipeline.jobs.along_routes import SENSOR_HEIGHT, plan_observe
+from tilestream.pipeline.stages.map_plan import MapPlan
+from tilestream.pipeline.stages.observe import Observing, observe
+from tilestream.records import Route
+from tilestream.report.comparison import CELL_COLUMNS, ROW_COLUMNS, USUAL, Comparison
+from tilestream.sensors import Sensor
+from tilestream.store import TileStore, cells_table
+from tilestream.tables import read_tables, remove_others
+from tilestream.tiling import MM_PER_M, whole_mm
+
+SPACING = 5.0
+"""Distance between sample points [m]: a comparison needs fewer than an estimate."""
+MOST_NAME = 60
+"""Characters of a sensor's name that go into the name of a choice."""
+FITTING = (200, 10_000)
+"""Cell sizes that are proposed where one does not fit [mm]."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A lidar on a vehicle, and the resolution of the map that it is matched with.
+
+    Raises:
+        UsageError: a range beyond the sensor's, a blind sector or cell size that cannot be.
+    """
+
+    sensor: Sensor
+    """What looks."""
+    range_max: float | None = None
+    """Usable range [m]; None: the sensor's."""
+    blind_rear_deg: float = 0.0
+    """Sector to the rear that the vehicle hides [deg]."""
+    cell_size: float = 2.0
+    """Edge of an NDT cell [m], whole millimetres."""
+
+    def __post_init__(self) -> None:
+        self.seeing(VirtualSettings())
+        if self.range_max is not None and self.range_max > self.sensor.range_max:
+            raise UsageError(
+                f"{self.sensor.name} sees {self.sensor.range_max:g} m: "
+                f"a range of {self.range_max:g} m is beyond that"
+            )
+        if whole_mm(self.cell_size, "cell_size") <= 0:
+            raise UsageError(f"cell_size is {self.cell_size:g} m: give more than 0")
+
+    @property
+    def vehicle(self) -> str:
+        """The choice but for the cell size, e.g. `VLP16-60m-rear120`; safe as a folder's name."""
+        name = re.sub(r"[^A-Za-z0-9_+.-]", "_", self.sensor.name)[:MOST_NAME].lstrip(".")
+        parts = [
+            name or "sensor",
+            "" if self.range_max is None else f"{self.range_max:g}m",
+            f"rear{self.blind_rear_deg:g}" if self.blind_rear_deg else "",
+        ]
+        return "-".join(part for part in parts if part)
+
+    @property
+    def name(self) -> str:
+        """What to call it, e.g. `VLP16-60m-cell2m`; safe as a folder's name."""
+        return f"{self.vehicle}-cell{self.cell_size:g}m"
+
+    def seeing(self, base: VirtualSettings) -> VirtualSettings:
+        """How it sees: its range and blind sector, the rest as in `base`."""
+        own = {"range_max": self.range_max, "blind_rear_deg": self.blind_rear_deg}
+        return VirtualSettings(**(base.model_dump() | own))
+
+
+def choices_of(
+    sensors: Sequence[Sensor],
+    ranges: Sequence[float | None],
+    blind_rears_deg: Sequence[float],
+    cell_sizes: Sequence[float],
+) -> tuple[Choice, ...]:
+    """Every sensor at every range, blind sector and cell size, the last changing fastest.
+
+    Raises:
+        UsageError: as `Choice`.
+    """
+    product = itertools.product(sensors, ranges, blind_rears_deg, cell_sizes)
+    return tuple(Choice(*choice) for choice in product)
+
+
+def compare(
+    store: TileStore,
+    routes: Iterable[Route],
+    out: str | os.PathLike[str],
+    choices: Sequence[Choice],
+    *,
+    spacing: float = SPACING,
+    registration: RegistrationSettings | None = None,
+    sensor_height: float = SENSOR_HEIGHT,
+    seeing: VirtualSettings | None = None,
+    client: Any | None = None,
+    memory: int = DEFAULT_MEMORY,
+    watch: Watch | None = None,
+) -> Comparison:
+    """The virtual drive along routes as each of several choices, resumable, in parallel.
+
+    Args:
+        store: the map; it keeps the cells of every size that is compared, of all its tiles.
+        routes: where; in the map's frame, each with a name of its own.
+        out: folder of the tables, `<choice>/observability/<tile>.parquet`, a local path or any
+            fsspec URL; other tables of these choices there are removed.
+        choices: what is compared, at least one, no two of one name.
+        spacing: distance between sample points [m].
+        registration: the matcher of the vehicle; default `RegistrationSettings()`.
+        sensor_height: height of the lidar above the route or the ground [m].
+        seeing: drop-outs, starts, seed; its range and blind sector give way to each choice's.
+        client: a Dask client to run on; None: this process.
+        memory: what a task may use [bytes].
+        watch: is told of each task that ended.
+
+    Returns:
+        The rows of all choices and the cells of the map, the same to the bit on any number of
+        workers.
+
+    Raises:
+        UsageError: no choices or two of one name, a cell size that the tiles are no multiple of,
+            no routes, two of one name, settings that cannot be.
+        PlanError: a task does not fit `memory`.
+        PartialError: some tasks failed; the message lists them, the rest is done.
+    """
+    routes, registration = list(routes), registration or RegistrationSettings()
+    seeing = seeing or VirtualSettings()
+    plan = plan_compare(
+        store, routes, out, choices, spacing, registration, sensor_height, seeing, memory
+    )
+    tables: dict[str, list[str]] = {choice.name: [] for choice in choices}
+    for path in paths_of(plan.outputs(observe.name)):
+        tables[path.rsplit("/", 3)[1]].append(path)
+    for kept in tables.values():
+        remove_others(kept)
+    outcomes = execute(plan, client, watch)
+    failures = {outcome.key: outcome.reason for outcome in outcomes if not outcome.ok}
+    if failures:
+        raise PartialError(f"{out}: {len(failures)} tasks failed, the rest is done:", failures)
+    order = [route.route_id for route in routes]
+    rows = pd.concat(
+        [rows_of(choice, tables[choice.name], order, store) for choice in choices],
+        ignore_index=True,
+    )
+    own = {"range_max", "blind_rear_deg"}
+    facts = {
+        "map": store.url,
+        "tile_size": store.settings.tile_size,
+        "spacing": spacing,
+        "sensor_height": sensor_height,
+        **{f"registration.{name}": value for name, value in registration.model_dump().items()},
+        **{f"seeing.{name}": value for name, value in seeing.model_dump(exclude=own).items()},
+    }
+    return Comparison(rows, choice_table(choices), cells_of_map(plan, store), facts)
+
+
+def plan_compare(
+    store: TileStore,
+    routes: Sequence[Route],
+    out: str | os.PathLike[str],
+    choices: Sequence[Choice],
+    spacing: float,
+    registration: RegistrationSettings,
+    sensor_height: float,
+    seeing: VirtualSettings,
+    memory: int,
+) -> Plan:
+    """What `compare` will run; arguments and errors as there."""
+    require_names(choices)
+    sizes_mm = sorted({whole_mm(choice.cell_size, "cell_size") for choice in choices})
+    require_sizes(store, sizes_mm)
+    map_plan, tasks = MapPlan.of_store(store), []
+    samples = samples_by_tile(store.grid, routes, spacing)
+    for choice in choices:
+        observing = Observing(
+            choice.sensor, choice.seeing(seeing), registration, choice.cell_size, sensor_height
+        )
+        folder = f"{os.fspath(out)}/{choice.name}"
+        planned = plan_observe(map_plan, samples, folder, observing, memory, group=choice.name)
+        tasks += planned.outputs(observe.name)
+    usual_mm = whole_mm(USUAL, "cell_size")
+    counted = {*sizes_mm, usual_mm} if store.grid.tile_mm % usual_mm == 0 else set(sizes_mm)
+    for key, size_mm in itertools.product(sorted(map_plan.points), sorted(counted)):
+        map_plan.cells(key, size_mm)  # also of tiles that no route sees: the map's size
+    return Plan.of((*map_plan.tasks.values(), *tasks), memory)
+
+
+def require_names(choices: Sequence[Choice]) -> None:
+    """Refuse choices whose folders or lines could not be told apart.
+
+    Raises:
+        UsageError: none, or two of one name (upper and lower case are one).
+    """
+    if not choices:
+        raise UsageError("nothing to compare: give at least one choice")
+    names = [choice.name.lower() for choice in choices]
+    for choice, name in zip(choices, names, strict=True):
+        if names.count(name) > 1:
+            raise UsageError(
+                f"two choices are named {choice.name}: give each once, and each sensor a name of "
+                "its own"
+            )
+
+
+def require_sizes(store: TileStore, sizes_mm: Sequence[int]) -> None:
+    """Refuse cell sizes of which the tile size is no multiple.
+
+    Raises:
+        UsageError: says which sizes fit this store, and which tiles would fit all of these.
+    """
+    tile_mm = store.grid.tile_mm
+    wrong = [size for size in sizes_mm if tile_mm % size]
+    if not wrong:
+        return
+    low, high = FITTING
+    fitting = [size for size in range(low, high + 1, 50) if tile_mm % size == 0] or [tile_mm]
+    common = math.lcm(*sizes_mm)
+    raise UsageError(
+        f"cell size {_metres(wrong)} does not divide the tiles of {store.url}, "
+        f"{_metres([tile_mm])}: sizes that fit are {_metres(fitting)}; all of "
+        f"{_metres(sizes_mm)} fit tiles of {_metres([common * max(1, round(tile_mm / common))])}"
+    )
+
+
+def _metres(sizes_mm: Iterable[int]) -> str:
+    return ", ".join(f"{size / MM_PER_M:g}" for size in sizes_mm) + " m"
+
+
+def rows_of(
+    choice: Choice, tables: Sequence[str], routes: Sequence[str], store: TileStore
+) -> pd.DataFrame:
+    """The sample points of a choice from its tables, route by route and along each."""
+    rows = in_route_order(read_tables(tables), routes)
+    rows["choice"] = choice.name
+    places = zip(rows["x"], rows["y"], strict=True)
+    rows["tile"] = [str(store.grid.key_at(x, y)) for x, y in places]
+    return rows[list(ROW_COLUMNS)]
+
+
+def cells_of_map(plan: Plan, store: TileStore) -> pd.DataFrame:
+    """How many cells each tile has at each size, as the marks of the finished plan say."""
+    sizes = sorted({task.takes["cell_mm"] for task in plan.outputs("cells")})
+    rows = [
+        (str(key), size / MM_PER_M, mark.facts["cells"])
+        for size in sizes
+        for key, mark in store.marks(cells_table(size).name).items()
+        if mark.status == "done"
+    ]
+    table = pd.DataFrame(rows, columns=list(CELL_COLUMNS))
+    return table.sort_values(["cell_size", "tile"], ignore_index=True)
+
+
+def choice_table(choices: Sequence[Choice]) -> pd.DataFrame:
+    """The choices as a table: a row each."""
+    return pd.DataFrame(
+        {
+            "choice": [choice.name for choice in choices],
+            "vehicle": [choice.vehicle for choice in choices],
+            "sensor": [choice.sensor.name for choice in choices],
+            "range_max": [choice.range_max or choice.sensor.range_max for choice in choices],
+            "blind_rear_deg": [choice.blind_rear_deg for choice in choices],
+            "cell_size": [whole_mm(c.cell_size, "cell_size") / MM_PER_M for c in choices],
+        }
+    )

@@ -1,0 +1,85 @@
+"""What became of a piece of work: one mark for a tile's arrays, a Parquet table and any file."""
+
+import dataclasses
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel
+
+from tilestream.version import VERSION
+
+Status = Literal["missing", "done", "failed", "skipped"]
+
+
+@dataclass(frozen=True)
+class Mark:
+    """What became of a table; written last, checked by every reader."""
+
+    status: Status
+    """`done`: whole. `failed` or `skipped`: not there, and `reason` says why."""
+    reason: str = ""
+    """Why it failed or was skipped."""
+    identity: str = ""
+    """Hash of all that it was made from (`identity_of`)."""
+    code: str = VERSION
+    """Version of the package that made it, for people: the identity does not depend on it."""
+    facts: dict[str, Any] = field(default_factory=dict)
+    """Small facts that are read without the table: counts, extents, what it was made with."""
+
+    def is_of(self, identity: str) -> bool:
+        """Whether the table is whole and was made from this."""
+        return self.status == "done" and self.identity == identity
+
+
+MISSING = Mark(status="missing", reason="not written yet", code="")
+
+
+def hash_of(*values: Any) -> str:
+    """Hex digest (128 bit) of values, the same on every machine; see `canonical`."""
+    text = json.dumps(canonical(values), sort_keys=True, separators=(",", ":"))
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+def identity_of(
+    stage: str, version: int, takes: Mapping[str, Any], reads: Mapping[str, Any]
+) -> str:
+    """The identity of what a stage makes: the same work has the same, and only that.
+
+    Args:
+        stage: name of the stage.
+        version: its version.
+        takes: the settings that its function takes, by argument.
+        reads: the identities of what it reads, by argument.
+    """
+    return hash_of(stage, version, takes, reads)
+
+
+def canonical(value: Any) -> Any:
+    """A value as JSON holds it: settings and records by field, arrays by the hash of their bytes.
+
+    Raises:
+        TypeError: a value of a type that has no such form.
+    """
+    if isinstance(value, BaseModel):
+        return canonical(value.model_dump())
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: canonical(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(name): canonical(inner) for name, inner in value.items()}
+    if isinstance(value, tuple | list):
+        return [canonical(inner) for inner in value]
+    if isinstance(value, np.ndarray):
+        digest = hashlib.blake2b(np.ascontiguousarray(value).tobytes(), digest_size=16)
+        return [str(value.dtype), list(value.shape), digest.hexdigest()]
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise TypeError(f"{type(value).__name__} has no canonical form: {value!r}")

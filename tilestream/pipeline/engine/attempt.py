@@ -1,0 +1,110 @@
+"""How a task is performed, whatever its stage, and what became of it."""
+
+import time
+import traceback
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from tilestream.errors import TileNotReadyError, TilestreamError
+from tilestream.pipeline.engine.outputs import Facts, Made, TileArrays
+from tilestream.pipeline.engine.plan import require_fit
+from tilestream.pipeline.engine.stage import BASE_BYTES, Task
+
+NOT_RUN = "not run, since "
+"""How the reason of a task begins that was refused because of another one."""
+STANDING = (FileExistsError, IsADirectoryError, NotADirectoryError, PermissionError)
+"""What the disk refuses in the same way however often it is asked."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a task."""
+
+    key: str
+    """The task's key."""
+    stage: str
+    """The task's stage."""
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    """Small facts of what it made; none where it failed."""
+    made: bool = False
+    """Whether it made something: else it failed, or found its work done."""
+    reason: str = ""
+    """Why it failed; empty where it did not."""
+    seconds: float = 0.0
+    """How long it ran [s]."""
+    details: str = ""
+    """The traceback of a failure, for --debug."""
+    passing: bool = False
+    """Whether another try may succeed: the machine failed, not the data."""
+
+    @property
+    def ok(self) -> bool:
+        """Whether the task is done."""
+        return not self.reason
+
+    @property
+    def refused(self) -> bool:
+        """Whether it was not run, since a task that it needs had failed."""
+        return self.reason.startswith(NOT_RUN)
+
+
+def perform(task: Task, memory: int | None) -> tuple[Facts, bool]:
+    """Do the work of a task, unless it is done; the facts, and whether anything was made.
+
+    Raises:
+        PlanError: what it reads is larger than was expected, and does not fit.
+        Exception: whatever its function raises is its failure.
+    """
+    known = task.writes.known(task.identity)
+    if known is not None:
+        return known, False
+    if memory is not None:
+        require_fit(task, BASE_BYTES + task.applies.memory(_read_counts(task)), memory)
+    try:
+        made = task.applies.function(**task.arguments())
+    except TileNotReadyError as error:
+        if task.applies.tells_failures and isinstance(task.writes, TileArrays):
+            return task.writes.refuse(str(error), task.identity), True
+        raise
+    whole = made if isinstance(made, Made) else Made(made)
+    return task.writes.write(whole, task.identity, task.applies.columns), True
+
+
+def _read_counts(task: Task) -> Mapping[str, int]:
+    """How much a task reads: as it is there, else as the plan expected."""
+    there: Counter[str] = Counter()
+    for what in task.reads.values():
+        for one in what if isinstance(what, tuple) else (what,):
+            there.update(one.counts())
+    return {**task.counts, **there}
+
+
+def attempt(task: Task, memory: int | None = None) -> Outcome:
+    """Do the work of a task and say what became of it; never raises.
+
+    A verdict of our own on the data (`TilestreamError`), a path that cannot be used and a bug
+    stand; where the disk, the network or the memory failed, another try may succeed.
+
+    Args:
+        task: what to do.
+        memory: what it may use [bytes]; None: whatever it needs.
+    """
+    began, passing = time.perf_counter(), False
+    try:
+        facts, made = perform(task, memory)
+    except TilestreamError as error:
+        reason, details = str(error), traceback.format_exc()
+    except MemoryError:
+        reason, details = "out of memory: allow less work at a time (--memory)", ""
+        passing = True
+    except OSError as error:
+        reason, details = f"{error} ({type(error).__name__})", traceback.format_exc()
+        passing = not isinstance(error, STANDING)
+    except Exception as error:  # noqa: BLE001 - whatever fails is listed, and the others go on
+        reason, details = f"{type(error).__name__}: {error}", traceback.format_exc()
+    else:
+        return Outcome(task.key, task.stage, facts, made, seconds=time.perf_counter() - began)
+    seconds = time.perf_counter() - began
+    return Outcome(task.key, task.stage, {}, False, reason, seconds, details, passing)

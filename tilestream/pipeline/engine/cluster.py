@@ -1,0 +1,186 @@
+"""The Dask cluster that tasks run on: one of our own on this machine, or one that is there."""
+
+import logging
+import os
+import signal
+import ssl
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import dask.config
+import distributed
+from dask.system import CPU_COUNT
+from distributed.comm.core import CommClosedError
+from distributed.utils import silence_logging_cmgr
+
+from tilestream.errors import TaskError, UsageError
+from tilestream.pipeline.engine.plan import megabytes
+
+logger = logging.getLogger(__name__)
+
+LOOPBACK = "127.0.0.1"
+ONE_THREAD = {
+    f"{library}_NUM_THREADS": "1" for library in ("NUMBA", "OPENBLAS", "OMP", "MKL", "VECLIB")
+}
+"""Environment of a worker: its process is its one thread."""
+
+
+@dataclass(frozen=True)
+class TlsFiles:
+    """The certificates that client, scheduler and workers know each other by (PEM)."""
+
+    ca: str
+    """Path of the certificate of the authority that signed the others."""
+    cert: str
+    """Path of this cluster's certificate."""
+    key: str
+    """Path of its private key."""
+
+    def security(self) -> Any:
+        """As Dask takes them; nothing unencrypted is let in.
+
+        Raises:
+            UsageError: they cannot be read, or the key is not the certificate's.
+        """
+        try:
+            ssl.create_default_context(cafile=self.ca).load_cert_chain(self.cert, self.key)
+        except OSError as error:
+            files = f"{self.ca}, {self.cert} and {self.key}"
+            raise UsageError(f"{files} are no certificates that fit together: {error}") from error
+        roles = ("client", "scheduler", "worker")
+        named = {f"tls_{role}_cert": self.cert for role in roles}
+        named |= {f"tls_{role}_key": self.key for role in roles}
+        return distributed.Security(tls_ca_file=self.ca, require_encryption=True, **named)
+
+
+class _DeafToInterrupts(distributed.WorkerPlugin):
+    """Lets a worker of our own live through Ctrl-C, which a terminal sends to all its processes.
+
+    The command ends, and takes its workers along; without them it would wait for others.
+    """
+
+    def setup(self, worker: Any) -> None:  # noqa: ARG002 - Dask's signature
+        """In a worker's main thread, also of one that was restarted."""
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+@contextmanager
+def dask_client(
+    scheduler: str | None,
+    workers: int | None,
+    memory: int,
+    *,
+    host: str = LOOPBACK,
+    tls: TlsFiles | None = None,
+) -> Iterator[Any | None]:
+    """A Dask client, or None where the tasks run in this process.
+
+    Args:
+        scheduler: address of a running scheduler, e.g. `tcp://10.0.0.1:8786` or `tls://…`; None: a
+            local one.
+        workers: worker processes of the local cluster, one thread each; None: one per core; 1
+            without a scheduler: no cluster, this process does the work.
+        memory: what a task may use [bytes]. A worker of the local cluster is restarted when it
+            comes near twice that: a broken promise ends in a reason, not in a machine that swaps.
+        host: address that the local scheduler and its dashboard listen on.
+        tls: certificates; None: as Dask's own configuration says (`distributed.comm.tls`).
+
+    Raises:
+        TaskError: nobody answers at the scheduler's address.
+        UsageError: the scheduler's address is none, or certificates are missing or do not fit.
+    """
+    security = None if tls is None else tls.security()
+    count = CPU_COUNT if workers is None else workers
+    if scheduler is not None:
+        logger.info("connecting to %s", scheduler)
+        with silence_logging_cmgr(logging.CRITICAL), _connected(scheduler, security) as client:
+            yield client
+    elif count > 1:
+        if host != LOOPBACK:
+            risk = "run code here; use TLS, or a network that you trust"
+            logger.warning(
+                "scheduler and dashboard listen on %s: whoever reaches them can %s",
+                host,
+                risk if tls is None else "watch the run, though only certificates let them act",
+            )
+        logger.info("starting %d workers; the first time, they compile kernels for a minute", count)
+        with (
+            distributed.LocalCluster(
+                n_workers=count,
+                threads_per_worker=1,
+                memory_limit=2 * memory,
+                host=host,
+                dashboard_address=f"{host}:0",
+                protocol="tcp://" if tls is None else "tls://",
+                security=security,
+                silence_logs=logging.CRITICAL,  # what failed is told once, by the outcomes
+                env=ONE_THREAD,
+            ) as cluster,
+            distributed.Client(cluster) as client,
+        ):
+            client.register_plugin(_DeafToInterrupts())
+            logger.debug("%d workers of %s each", count, megabytes(2 * memory))
+            yield client
+    else:
+        yield None
+
+
+class _Client(distributed.Client):
+    """A client that is closed at once where it cannot connect.
+
+    Left to the garbage collector it would close itself at any moment, even while its own thread
+    holds the lock of Dask's event loops, and would wait for that lock for ever.
+    """
+
+    def start(self, **kwargs: Any) -> None:
+        """Connect, as the constructor of Dask's client asks for."""
+        try:
+            super().start(**kwargs)  # type: ignore[no-untyped-call]
+        except BaseException:
+            self.close()  # type: ignore[no-untyped-call]
+            self._loop_runner.stop()  # which is left running where Dask closed the client itself
+            raise
+
+
+@contextmanager
+def _connected(scheduler: str, security: Any | None) -> Iterator[Any]:
+    """A client of a scheduler that runs elsewhere."""
+    encrypted = scheduler.startswith("tls:")
+    if encrypted and security is None and not dask.config.get("distributed.comm.tls.ca-file"):
+        raise UsageError(f"{scheduler} wants certificates: give --tls-ca, --tls-cert and --tls-key")
+    try:
+        client = _Client(scheduler, security=security)  # type: ignore[no-untyped-call]
+    except (OSError, TimeoutError, CommClosedError) as error:
+        hint = ", or not to these certificates" if encrypted else ""
+        raise TaskError(f"no Dask scheduler answers at {scheduler}{hint}: {error}") from error
+    except (ValueError, TypeError, RuntimeError) as error:  # of certificates for an address that
+        # takes none, or of an address that is none
+        raise UsageError(f"{scheduler!r} is no scheduler that can be asked: {error}") from error
+    with client:
+        yield client
+
+
+@contextmanager
+def report_kept(client: Any | None, path: str | os.PathLike[str]) -> Iterator[None]:
+    """Keep Dask's own performance report of what runs inside, as one HTML file.
+
+    Args:
+        client: a Dask client; None: there is nothing to report.
+        path: the file, replaced; where Dask cannot make it any more (the scheduler is lost), a
+            warning says so and nothing else is disturbed.
+    """
+    if client is None:
+        yield
+        return
+    report = distributed.performance_report(filename=os.fspath(path), mode="inline")
+    with client.as_current():
+        report.__enter__()
+        try:
+            yield
+        finally:
+            try:
+                report.__exit__(None, None, None)
+            except Exception as error:  # noqa: BLE001 - a report must not hide what happened
+                logger.warning("no Dask performance report at %s: %s", path, error or repr(error))

@@ -1,0 +1,97 @@
+"""Where results go: written whole, marked last, known again by their identity."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
+
+import pandas as pd
+
+from tilestream.marks import Mark
+from tilestream.records import Column
+from tilestream.store import Tile, open_store
+from tilestream.tables import read_mark, read_tables, write_table
+from tilestream.tiling import TileKey
+
+Facts = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Made:
+    """What a stage's function made, with small facts that the mark keeps."""
+
+    value: Any
+    facts: dict[str, Any] = field(default_factory=dict)
+
+
+class Stored(NamedTuple):
+    """A Parquet table as it is read back."""
+
+    rows: pd.DataFrame
+    facts: dict[str, Any]
+
+
+class Output(Protocol):
+    """A place for one result."""
+
+    def known(self, identity: str) -> Facts | None:
+        """The facts of what is there, if it is whole and of this identity; else None."""
+
+    def write(self, made: Made, identity: str, columns: Sequence[Column]) -> Facts:
+        """Replace what is there by a result; its facts."""
+
+    def read(self) -> Any:
+        """What was written."""
+
+
+@dataclass(frozen=True)
+class TileArrays:
+    """A table of a tile of a store: an array per column."""
+
+    store_url: str
+    tile: TileKey
+    table: str
+
+    def known(self, identity: str) -> Facts | None:
+        """As `Output`."""
+        mark = self._there().mark(self.table)
+        return mark.facts if mark.is_of(identity) else None
+
+    def write(self, made: Made, identity: str, columns: Sequence[Column]) -> Facts:  # noqa: ARG002
+        """As `Output`; the value is a dictionary of arrays."""
+        mark = Mark("done", identity=identity, facts=made.facts)
+        self._there().write_table(self.table, made.value, mark)
+        return made.facts
+
+    def refuse(self, reason: str, identity: str) -> Facts:
+        """Replace what is there by the reason why there is nothing."""
+        self._there().write_reason(self.table, Mark("failed", reason, identity))
+        return {"failed": reason}
+
+    def read(self) -> Any:
+        """The columns by name."""
+        return self._there().read_table(self.table)
+
+    def _there(self) -> Tile:
+        return Tile(open_store(self.store_url), self.tile)
+
+
+@dataclass(frozen=True)
+class Parquet:
+    """A table with documented columns in a file of its own."""
+
+    path: str
+
+    def known(self, identity: str) -> Facts | None:
+        """As `Output`."""
+        mark = read_mark(self.path)
+        return mark.facts if mark.is_of(identity) else None
+
+    def write(self, made: Made, identity: str, columns: Sequence[Column]) -> Facts:
+        """As `Output`; the value is a data frame."""
+        facts = {"rows": len(made.value), **made.facts}
+        write_table(self.path, made.value, columns, Mark("done", identity=identity, facts=facts))
+        return {"rows": len(made.value)}
+
+    def read(self) -> Stored:
+        """The rows, and the facts of the mark."""
+        return Stored(read_tables([self.path]), read_mark(self.path).facts)

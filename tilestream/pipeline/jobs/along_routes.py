@@ -1,0 +1,194 @@
+"""The jobs along routes: the factors, or the observability, of every sample point of them."""
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import pandas as pd
+
+from tilestream.config import RegistrationSettings
+from tilestream.errors import PartialError
+from tilestream.factors.catalogue import Which
+from tilestream.factors.rows import Samples, in_route_order, samples_by_tile
+from tilestream.factors.virtual_scan import VirtualSettings
+from tilestream.pipeline.engine.executor import Watch, execute
+from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, paths_of
+from tilestream.pipeline.stages.factors import Looking, factors, factors_task
+from tilestream.pipeline.stages.map_plan import MapPlan
+from tilestream.pipeline.stages.observe import Observing, observe, observe_task
+from tilestream.records import Route
+from tilestream.sensors import VLP16, Sensor
+from tilestream.store import TileStore
+from tilestream.tables import read_tables, remove_others
+from tilestream.tiling import TileKey, whole_mm
+
+SENSOR_HEIGHT = 2.0
+"""Height of the lidar above the road [m] (the paper's vehicle)."""
+
+
+def factors_along(
+    store: TileStore,
+    routes: Iterable[Route],
+    out: str | os.PathLike[str],
+    *,
+    spacing: float = 1.0,
+    sensor: Sensor = VLP16,
+    sensor_height: float = SENSOR_HEIGHT,
+    cell_size: float = 2.0,
+    which: Which = "all",
+    client: Any | None = None,
+    memory: int = DEFAULT_MEMORY,
+    watch: Watch | None = None,
+) -> pd.DataFrame:
+    """The factors of sample points along routes, tile by tile, resumable, in parallel.
+
+    Args:
+        store: the map.
+        routes: where; in the map's frame, each with a name of its own.
+        out: folder of the tables, `factors/<tile>.parquet`, a local path or any fsspec URL; tables
+            of an earlier, other job there are removed.
+        spacing: distance between sample points [m].
+        sensor: what looks.
+        sensor_height: height of the lidar above the route, or above the ground where the route
+            has no z [m].
+        cell_size: edge of an NDT cell [m].
+        which: `faithful` (the paper's 20), `robust` (their twins), or `all`.
+        client: a Dask client to run on; None: this process.
+        memory: what a task may use [bytes].
+        watch: is told of each task that ended.
+
+    Returns:
+        A row per sample point, route by route and along each; `status` and `reason` say where
+        there are no factors.
+
+    Raises:
+        UsageError: no routes, two of one name, settings that cannot be.
+        PlanError: a task does not fit `memory`.
+        PartialError: some tasks failed; the message lists them, the rest is done.
+    """
+    routes = list(routes)
+    looking = Looking(sensor, cell_size, which, sensor_height)
+    samples = samples_by_tile(store.grid, routes, spacing)
+    plan = plan_factors(MapPlan.of_store(store), samples, out, looking, memory)
+    return _tables_of(plan, factors.name, routes, client, watch)
+
+
+def plan_factors(
+    map_plan: MapPlan,
+    samples: Mapping[TileKey, Samples],
+    out: str | os.PathLike[str],
+    looking: Looking,
+    memory: int,
+) -> Plan:
+    """What `factors_along` will run; other arguments and errors as there.
+
+    Args:
+        map_plan: the map.
+        samples: the sample points by tile (`samples_by_tile`).
+        out: folder of the tables.
+        looking: what the factors are made with.
+        memory: what a task may use [bytes].
+    """
+    map_plan.store.grid.require_cell_size(whole_mm(looking.cell_size, "cell_size"))
+    folder = os.fspath(out)
+    tasks = [factors_task(map_plan, key, some, looking, folder) for key, some in samples.items()]
+    return Plan.of((*map_plan.tasks.values(), *tasks), memory)
+
+
+def observe_along(
+    store: TileStore,
+    routes: Iterable[Route],
+    out: str | os.PathLike[str],
+    *,
+    spacing: float = 1.0,
+    sensor: Sensor = VLP16,
+    seeing: VirtualSettings | None = None,
+    registration: RegistrationSettings | None = None,
+    sensor_height: float = SENSOR_HEIGHT,
+    cell_size: float = 2.0,
+    client: Any | None = None,
+    memory: int = DEFAULT_MEMORY,
+    watch: Watch | None = None,
+) -> pd.DataFrame:
+    """Observability of sample points along routes, tile by tile, resumable, in parallel.
+
+    Args:
+        store: the map.
+        routes: where; in the map's frame, each with a name of its own.
+        out: folder of the tables, `observability/<tile>.parquet`, a local path or any fsspec URL;
+            tables of an earlier, other job there are removed.
+        spacing: distance between sample points [m].
+        sensor: what looks.
+        seeing: usable range, blind sector, drop-outs, starts; default `VirtualSettings()`.
+        registration: the matcher of the vehicle; default `RegistrationSettings()`.
+        sensor_height: height of the lidar above the route, or above the ground where the route
+            has no z [m].
+        cell_size: edge of an NDT cell [m].
+        client: a Dask client to run on; None: this process.
+        memory: what a task may use [bytes].
+        watch: is told of each task that ended.
+
+    Returns:
+        A row per sample point, route by route and along each: place, the columns of the criterion,
+        `status` and `reason` (see `observability`).
+
+    Raises:
+        UsageError: no routes, two of one name, settings that cannot be.
+        PlanError: a task does not fit `memory`.
+        PartialError: some tasks failed; the message lists them, the rest is done.
+    """
+    routes = list(routes)
+    observing = Observing(
+        sensor,
+        seeing or VirtualSettings(),
+        registration or RegistrationSettings(),
+        cell_size,
+        sensor_height,
+    )
+    samples = samples_by_tile(store.grid, routes, spacing)
+    plan = plan_observe(MapPlan.of_store(store), samples, out, observing, memory)
+    return _tables_of(plan, observe.name, routes, client, watch)
+
+
+def plan_observe(
+    map_plan: MapPlan,
+    samples: Mapping[TileKey, Samples],
+    out: str | os.PathLike[str],
+    observing: Observing,
+    memory: int,
+    group: str = "",
+) -> Plan:
+    """What `observe_along` will run; other arguments and errors as there.
+
+    Args:
+        map_plan: the map.
+        samples: the sample points by tile (`samples_by_tile`).
+        out: folder of the tables.
+        observing: what is observed with.
+        memory: what a task may use [bytes].
+        group: as whose sensor, where one plan observes with several.
+    """
+    map_plan.store.grid.require_cell_size(whole_mm(observing.cell_size, "cell_size"))
+    folder = os.fspath(out)
+    tasks = [
+        observe_task(map_plan, key, some, observing, folder, group) for key, some in samples.items()
+    ]
+    return Plan.of((*map_plan.tasks.values(), *tasks), memory)
+
+
+def _tables_of(
+    plan: Plan, stage: str, routes: Sequence[Route], client: Any | None, watch: Watch | None
+) -> pd.DataFrame:
+    """Run a plan, and read the tables of a stage; others beside them are removed.
+
+    Raises:
+        PartialError: some of its tasks failed; lists them.
+    """
+    tables = paths_of(plan.outputs(stage))
+    remove_others(tables)
+    outcomes = execute(plan, client, watch)
+    failures = {o.key: o.reason for o in outcomes if not o.ok and o.stage == stage}
+    if failures:
+        folder = tables[0].rsplit("/", 1)[0]
+        raise PartialError(f"{folder}: {len(failures)} tasks failed, the rest is done:", failures)
+    return in_route_order(read_tables(tables), [route.route_id for route in routes])

@@ -1,0 +1,112 @@
+"""What the main job would run, from headers alone: before anything is read or written."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tilestream.errors import StoreNotFoundError
+from tilestream.formats import describe
+from tilestream.pipeline.engine.attempt import Outcome
+from tilestream.pipeline.engine.stage import Task
+from tilestream.pipeline.jobs.ingest import plan_ingest
+from tilestream.pipeline.jobs.run_inputs import (
+    Inputs,
+    check_model,
+    extent,
+    ingest_settings,
+    inputs_of,
+    is_simulated,
+    map_scans,
+    simulated_folder,
+    simulations,
+)
+from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
+from tilestream.pipeline.jobs.run_settings import RunSettings, SimulateSettings
+from tilestream.pipeline.jobs.simulate import plan_simulation
+from tilestream.pipeline.stages.map_plan import MapPlan, TilePoints
+from tilestream.pipeline.stages.scatter import SourceSpan
+from tilestream.store import StoreSettings, TileStore, open_store
+from tilestream.tiling import MM_PER_M, Box, TileKey
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """What a job would do, told before it does anything."""
+
+    tasks: tuple[Task, ...]
+    """The tasks, each after those that it needs; of the map's tiles, those that there may be; of a
+    city that is not simulated yet, those that make it."""
+    notes: tuple[str, ...]
+    """What is not known before the job runs."""
+
+
+def forecast(settings: RunSettings) -> Forecast:
+    """What the main job would run; nothing is read beyond headers, nothing is written.
+
+    Raises:
+        PlanError: a task does not fit `memory`.
+        UsageError, SourceError, StoreError, ModelError: as the job itself.
+    """
+    check_model(settings)
+    if settings.simulate is not None and not is_simulated(settings):
+        return _simulation_first(settings, settings.simulate)
+    inputs = inputs_of(settings, None, None)
+    map_plan, reading, notes = _expected_map(settings, inputs)
+    measure = plan_measure(settings, inputs, map_plan)
+    done = [Outcome(task.key, task.stage) for task in measure.tasks]
+    estimate = plan_estimate(settings, map_plan.store.grid, measure, done)
+    return Forecast((*reading, *measure.tasks, *estimate.tasks), (*notes, *inputs.notes))
+
+
+def _simulation_first(settings: RunSettings, wanted: SimulateSettings) -> Forecast:
+    """What simulates the city, as far as it is not there."""
+    folder = simulated_folder(settings)
+    plans = [plan_simulation(drive, folder, **extent(wanted)) for drive in simulations(wanted)]
+    missing = {
+        task.writes: task
+        for plan in plans
+        for task in plan.tasks
+        if task.writes.known(task.identity) is None
+    }  # all drives have one survey
+    note = f"first the city is simulated in {folder}; plan again to see what follows"
+    return Forecast(tuple(missing.values()), (note,))
+
+
+def _expected_map(
+    settings: RunSettings, inputs: Inputs
+) -> tuple[MapPlan, tuple[Task, ...], list[str]]:
+    """The map as it is, or as the bounds of its sources let expect it."""
+    try:
+        store = open_store(settings.store_url)
+    except StoreNotFoundError:
+        if not inputs.sources:
+            raise
+    else:
+        if store.sources():
+            notes = ["the map is there; changed sources are read again"]
+            return MapPlan.of_store(store), (), notes
+    plan = plan_ingest(
+        inputs.sources,
+        settings.store_url,
+        ingest_settings(settings),
+        settings.memory,
+        settings.map.points_topic,
+        settings.map.pose_topic,
+        map_scans(settings, inputs),
+    )
+    store = TileStore(settings.store_url, StoreSettings(**ingest_settings(settings).model_dump()))
+    have: dict[TileKey, TilePoints] = {}
+    unknown: list[str] = []
+    spans = [task.reads["blocks"] for task in plan.tasks]
+    for path in sorted({span.path for span in spans if isinstance(span, SourceSpan)}):
+        bounds = describe(path).bounds
+        if bounds is None:
+            unknown.append(path)
+        else:
+            low, high = (np.round(np.array(corner) * MM_PER_M).astype(int) for corner in bounds)
+            box = Box(int(low[0]), int(low[1]), int(high[0]) + 1, int(high[1]) + 1)
+            have |= dict.fromkeys(store.grid.keys_over(box), TilePoints("expected", "", 0))
+    notes = [f"at most {len(have)} tiles, by the bounds of the sources; reading tells which"]
+    if unknown:
+        notes.append(f"only reading tells where the points of {', '.join(unknown[:3])} are")
+    return MapPlan(store, have), plan.tasks, notes

@@ -1,0 +1,401 @@
+"""The job that makes a map: sources in, tile store out, in ten steps over plan and run."""
+
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pyproj
+import pyproj.exceptions
+
+from tilestream.config import IngestSettings
+from tilestream.errors import (
+    CrsError,
+    PartialError,
+    SourceError,
+    SourceNotFoundError,
+    StoreNotFoundError,
+    UsageError,
+)
+from tilestream.formats import expand_sources, open_source
+from tilestream.formats.base import SourceInfo, Span
+from tilestream.formats.mcap import ScanSelection
+from tilestream.marks import hash_of
+from tilestream.pipeline.engine.attempt import Outcome
+from tilestream.pipeline.engine.executor import Watch, execute
+from tilestream.pipeline.engine.outputs import TileArrays
+from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan
+from tilestream.pipeline.engine.stage import Task
+from tilestream.pipeline.stages.merge import merge, merge_tasks
+from tilestream.pipeline.stages.scatter import Fragment, SourceSpan, scatter, scatter_tasks
+from tilestream.store import POINTS, StoreSettings, TileStore, open_store
+
+POINTS_PER_TASK = 4_000_000
+"""Points of a source that one scatter task reads: seconds of work, not milliseconds."""
+MADE_BY = {stage.name: stage.version for stage in (scatter, merge)}
+"""What a map is made by: another version makes it anew."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """One input of an ingest, and what became of it."""
+
+    path: str
+    """The file, absolute, since workers may run elsewhere."""
+    state: str
+    """Hash of its size, time of change and way of reading: whether it is still the same."""
+    info: SourceInfo | None = None
+    """What is in it; None where it could not be opened."""
+    spans: tuple[Span, ...] = ()
+    """The pieces in which it is read."""
+    options: tuple[tuple[str, Any], ...] = ()
+    """How it is read: topics and scans of a log."""
+    points: int = 0
+    """Finite points that were read."""
+    dropped: int = 0
+    """Points that were not finite."""
+    reason: str = ""
+    """Why it failed; empty where it did not."""
+
+
+def ingest(
+    sources: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+    url: str | os.PathLike[str],
+    *,
+    tile_size: float = 100.0,
+    halo: float = 10.0,
+    map_leaf: float = 0.2,
+    crs: str | None = None,
+    client: Any | None = None,
+    memory: int = DEFAULT_MEMORY,
+    watch: Watch | None = None,
+    points_topic: str | None = None,
+    pose_topic: str | None = None,
+    scans: ScanSelection | None = None,
+) -> TileStore:
+    """Make a tile store from point clouds, map directories and logs of drives.
+
+    Sources are read in blocks, scattered to tile fragments, and each tile is merged and thinned by
+    one task, within the promised memory. A killed ingest continues where it was when called again;
+    a changed source redoes the tiles that it touches; unchanged tiles are kept.
+
+    Args:
+        sources: files, globs and Autoware map directories, mixed: PCD, LAS, LAZ, PLY, E57, MCAP.
+            They are the whole map: a source that the store knows must be given again.
+        url: the store, a local path or any fsspec URL.
+        tile_size: edge of a tile [m].
+        halo: what tasks read around a tile [m].
+        map_leaf: edge of the voxels that the map is thinned to [m]; 0 keeps all points.
+        crs: CRS of the map; None: that of the sources.
+        client: a Dask client to run on; None: this process.
+        memory: what a task may use [bytes].
+        watch: is told of each task that ended.
+        points_topic: topic of the scans in MCAP logs; None: found by type.
+        pose_topic: topic of the poses in MCAP logs; None: found by type.
+        scans: which scans of MCAP logs become the map; None: all.
+
+    Returns:
+        The store, with every tile that holds a point.
+
+    Raises:
+        UsageError: settings that cannot be, or that differ from those of the existing store.
+        SourceNotFoundError: a path or glob that matches nothing.
+        CrsError: two sources in different CRS, or a source that is not in `crs`.
+        PlanError: the job does not fit `memory`.
+        PartialError: some sources or tiles failed; the message lists them with reasons, and
+            the rest is done and can be opened.
+    """
+    settings = IngestSettings(tile_size=tile_size, halo=halo, map_leaf=map_leaf, crs=crs)
+    reading = read_sources(sources, url, settings, memory, points_topic, pose_topic, scans)
+    outcomes = execute(reading.first(), client, watch, grow=lambda o: reading.grown(o) or ())
+    failures = reading.close(outcomes)
+    if failures:
+        raise PartialError(
+            f"{reading.store.url}: {len(failures)} sources or tiles failed, the rest is done:",
+            failures,
+        )
+    return reading.store
+
+
+class Reading:
+    """A map in the making: its sources are read first, then it is known which tiles it has."""
+
+    def __init__(
+        self, store: TileStore, found: Sequence[Source], memory: int, current: bool
+    ) -> None:
+        """Sources, opened as far as their headers.
+
+        Args:
+            store: where the tiles go.
+            found: the sources.
+            memory: what a task may use [bytes].
+            current: whether the store is whole and made from these sources: nothing is left to do.
+        """
+        self.store = store
+        self.found = list(found)
+        self.merges: tuple[Task, ...] = ()
+        """The tasks that write tiles, once all sources are read."""
+        self._memory = memory
+        self._current = current
+        readable = [(s.info, s.spans, s.state, s.options) for s in found if s.info is not None]
+        self.scatters = Plan((), memory) if current else scatter_tasks(store, readable, memory)
+        """The tasks that read the sources."""
+        spans = {task.key: task.reads["blocks"] for task in self.scatters.tasks}
+        self._open = {key: span.path for key, span in spans.items() if isinstance(span, SourceSpan)}
+        self._read: dict[str, list[Outcome]] = {source.path: [] for source in found}
+
+    def first(self) -> Plan:
+        """What to run first: the tasks that read the sources.
+
+        Raises:
+            PartialError: none can be read; the map stays as it was.
+        """
+        if not self._current and not self.scatters.tasks:
+            self._sorted_out()
+        return self.scatters
+
+    def grown(self, outcome: Outcome) -> tuple[Task, ...] | None:
+        """The tasks that write the tiles, as soon as the last source is read; else None.
+
+        Raises:
+            PartialError: no source could be read; the map stays as it was.
+        """
+        path = self._open.pop(outcome.key, None)
+        if path is None:
+            return None
+        self._read[path].append(outcome)
+        return None if self._open else self._sorted_out()
+
+    def _sorted_out(self) -> tuple[Task, ...]:
+        fragments: list[Fragment] = []
+        for number, source in enumerate(self.found):
+            parts = self._read[source.path]
+            failed = [outcome.reason for outcome in parts if not outcome.ok]
+            if failed:
+                self.found[number] = replace(source, reason=failed[0])
+            elif not source.reason:
+                indices = [Fragment.of(outcome.facts) for outcome in parts]
+                points, dropped = (
+                    sum(getattr(index, name) for index in indices) for name in ("points", "dropped")
+                )
+                self.found[number] = replace(source, points=points, dropped=dropped)
+                fragments += indices
+        fragments.sort(key=lambda fragment: [int(part) for part in fragment.name.split("-")])
+        self.merges = merge_tasks(self.store, fragments, self._memory).tasks
+        failures = self._unread()
+        if failures and not self.merges:
+            self._record()
+            raise PartialError(
+                f"{self.store.url}: no source could be read, the map is as it was:", failures
+            )
+        for key in set(self.store.marks(POINTS)) - {task.tile for task in self.merges}:
+            self.store.remove(key)
+        return self.merges
+
+    def _unread(self) -> dict[str, str]:
+        return {source.path: source.reason for source in self.found if source.reason}
+
+    def close(self, outcomes: Sequence[Outcome]) -> dict[str, str]:
+        """Record what was made; what failed, with its reason.
+
+        Args:
+            outcomes: of the tasks that write tiles, others besides.
+
+        Raises:
+            SourceError: the sources hold no points.
+        """
+        if self._current:
+            return {}
+        ended = {outcome.key: outcome for outcome in outcomes}
+        failed = {task.key: ended[task.key].reason for task in self.merges if task.key in ended}
+        failed = {key: reason for key, reason in failed.items() if reason}
+        self.store.remove_fragments()  # first, since a full disk may need the room
+        for task in self.merges:
+            if task.key in failed and isinstance(task.writes, TileArrays):
+                task.writes.refuse(failed[task.key], task.identity)
+        self._record()
+        failures = self._unread() | failed
+        if not self.merges and not failures:
+            sources = ", ".join(source.path for source in self.found)
+            raise SourceError(f"{self.store.url}: the sources hold no points: {sources}")
+        return failures
+
+    def _record(self) -> None:
+        self.store.remove_fragments()
+        self.store.write_sources(
+            [
+                {
+                    "path": source.path,
+                    "state": source.state,
+                    "format": source.info.format if source.info else "",
+                    "size_bytes": source.info.size_bytes if source.info else 0,
+                    "crs": source.info.crs if source.info else None,
+                    "notes": list(source.info.notes) if source.info else [],
+                    "points": source.points,
+                    "dropped": source.dropped,
+                    "reason": source.reason,
+                }
+                for source in self.found
+            ],
+            MADE_BY,
+        )
+
+
+def read_sources(
+    sources: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+    url: str | os.PathLike[str],
+    settings: IngestSettings,
+    memory: int,
+    points_topic: str | None = None,
+    pose_topic: str | None = None,
+    scans: ScanSelection | None = None,
+) -> Reading:
+    """What `ingest` begins with; arguments and errors as there."""
+    found = _examine_all(sources, _log_options(points_topic, pose_topic, scans))
+    store = _create_or_resume(str(url), _with_crs(settings, found), found)
+    return Reading(store, found, memory, _is_current(store, found))
+
+
+def plan_ingest(
+    sources: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+    url: str | os.PathLike[str],
+    settings: IngestSettings,
+    memory: int = DEFAULT_MEMORY,
+    points_topic: str | None = None,
+    pose_topic: str | None = None,
+    scans: ScanSelection | None = None,
+) -> Plan:
+    """What `ingest` would read first, without running or writing anything.
+
+    The tasks that write tiles are planned from what the reading finds. Arguments and errors as for
+    `ingest`; a source that cannot be opened raises its own error here.
+    """
+    found = _examine_all(sources, _log_options(points_topic, pose_topic, scans))
+    for source in found:
+        if source.reason:
+            raise SourceError(source.reason)
+    store = TileStore(str(url), StoreSettings(**_with_crs(settings, found).model_dump()))
+    return Reading(store, found, memory, current=False).scatters
+
+
+def _log_options(
+    points_topic: str | None, pose_topic: str | None, scans: ScanSelection | None
+) -> dict[str, Any]:
+    wanted = {"points_topic": points_topic, "pose_topic": pose_topic, "scans": scans}
+    return {name: value for name, value in wanted.items() if value is not None}
+
+
+def _examine_all(
+    sources: str | os.PathLike[str] | Iterable[str | os.PathLike[str]], log_options: dict[str, Any]
+) -> list[Source]:
+    """Every file that the sources name, opened as far as its header.
+
+    Raises:
+        UsageError: there are no sources.
+        SourceNotFoundError: a path or glob that matches nothing.
+    """
+    if isinstance(sources, str | os.PathLike):
+        sources = [sources]
+    found: dict[str, Source] = {}
+    for pattern in [os.fspath(source) for source in sources]:
+        try:
+            paths = expand_sources(pattern)
+        except SourceNotFoundError:
+            raise
+        except SourceError as error:
+            found[pattern] = Source(pattern, state="", reason=str(error))
+            continue
+        for path in paths:
+            options = log_options if path.lower().endswith(".mcap") else {}
+            absolute = str(Path(path).absolute())
+            found.setdefault(absolute, _examine(absolute, options))
+    if not found:
+        raise UsageError("no sources: name at least one file, glob or map directory")
+    return [found[path] for path in sorted(found)]
+
+
+def _examine(path: str, options: dict[str, Any]) -> Source:
+    """Open a source as far as its header; a failure is its reason, not an exception."""
+    stat = Path(path).stat()
+    readable = tuple(sorted(options.items()))
+    known = Source(path, hash_of(stat.st_size, stat.st_mtime_ns, repr(readable)), options=readable)
+    try:
+        source = open_source(path, **options)
+        info = source.info()
+        spans = tuple(source.spans(POINTS_PER_TASK))
+    except (SourceError, OSError) as error:
+        return replace(known, reason=str(error))
+    return replace(known, info=info, spans=spans)
+
+
+def _with_crs(settings: IngestSettings, found: Sequence[Source]) -> IngestSettings:
+    """The settings with the one CRS of the map.
+
+    Raises:
+        CrsError: there are two, named with their sources, or one that pyproj cannot read.
+    """
+    named = [(s.path, s.info.crs) for s in found if s.info is not None and s.info.crs]
+    if settings.crs is not None:
+        named.insert(0, ("the crs that was asked for", settings.crs))
+    for who, crs in named[1:]:
+        if not _same_crs(named[0], (who, crs)):
+            raise CrsError(
+                f"{named[0][0]} is {_short(named[0][1])} and {who} is {_short(crs)}: bring all "
+                "sources into one CRS first (for example with PDAL's filters.reprojection)"
+            )
+    if named:
+        _parse_crs(*named[0])
+    return settings.model_copy(update={"crs": named[0][1] if named else None})
+
+
+def _same_crs(a: tuple[str, str], b: tuple[str, str]) -> bool:
+    return a[1] == b[1] or bool(_parse_crs(*a).equals(_parse_crs(*b), ignore_axis_order=True))
+
+
+def _parse_crs(who: str, text: str) -> pyproj.CRS:
+    try:
+        return pyproj.CRS.from_user_input(text)
+    except pyproj.exceptions.CRSError as error:
+        raise CrsError(f"{who}: {_short(text)} is no CRS that pyproj reads: {error}") from None
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= 80 else f"{text[:77]}…"
+
+
+def _create_or_resume(url: str, settings: IngestSettings, found: Sequence[Source]) -> TileStore:
+    """The store to write to: a new one, or the one that is there if it is the same map.
+
+    Raises:
+        UsageError: the store has other settings, or knows a source that was not given.
+    """
+    wanted = StoreSettings(**settings.model_dump())
+    try:
+        store = open_store(url)
+    except StoreNotFoundError:
+        return TileStore.create(url, wanted)
+    for name, value in asdict(wanted).items():
+        there = getattr(store.settings, name)
+        if there != value and not (name == "crs" and value is None):
+            raise UsageError(
+                f"{url} has {name} {there!r}, asked for is {value!r}: "
+                "use the same setting, or another path for the new store"
+            )
+    forgotten = sorted({s["path"] for s in store.sources()} - {s.path for s in found})
+    if forgotten:
+        raise UsageError(
+            f"{url} was also made from {', '.join(forgotten)}: give all sources of the map, "
+            "or another path for the new store"
+        )
+    return store
+
+
+def _is_current(store: TileStore, found: Sequence[Source]) -> bool:
+    """Whether the store is whole, and made from exactly these sources by these stages."""
+    recorded = {(s["path"], s["state"]) for s in store.sources() if not s["reason"]}
+    return (
+        recorded == {(s.path, s.state) for s in found}
+        and store.made_by() == MADE_BY
+        and all(mark.status == "done" for mark in store.marks(POINTS).values())
+    )

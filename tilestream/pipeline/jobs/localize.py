@@ -1,0 +1,240 @@
+"""The job that measures: a log and a map in, the localization error of every sample point out."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from tilestream.config import RegistrationSettings, StartSettings
+from tilestream.errors import PartialError, TileNotReadyError, UsageError
+from tilestream.formats.mcap import ScanLog, ScanSelection
+from tilestream.localization import start_poses
+from tilestream.pipeline.engine.executor import Watch, execute
+from tilestream.pipeline.engine.outputs import Parquet
+from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, paths_of
+from tilestream.pipeline.engine.stage import Task
+from tilestream.pipeline.stages.drive_scans import DriveScans, Reading, Sample
+from tilestream.pipeline.stages.label import label
+from tilestream.pipeline.stages.map_plan import MapPlan
+from tilestream.pipeline.stages.register import MARGIN, Measuring, register
+from tilestream.records import Float64, TruePose
+from tilestream.store import TileStore
+from tilestream.tables import read_tables, remove_others
+from tilestream.tiling import Box, TileKey, whole_mm
+
+SCANS_PER_TASK = 8
+"""Scans of a slice: about a second of work with 317 starts."""
+REACH = 250.0
+"""How far a scan is taken to see where nothing limits it [m]: as far as road lidars do."""
+
+
+def localize(
+    store: TileStore,
+    log: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    cell_size: float = 2.0,
+    spacing: float = 1.0,
+    registration: RegistrationSettings | None = None,
+    starts: StartSettings | None = None,
+    true_pose: TruePose = "log",
+    scans: ScanSelection | None = None,
+    reading: Reading | None = None,
+    starts_per_task: int | None = None,
+    client: Any | None = None,
+    memory: int = DEFAULT_MEMORY,
+    watch: Watch | None = None,
+) -> pd.DataFrame:
+    """Localize a drive in a map from many starts per sample point: what the error there is.
+
+    One scan is taken per sample point. Scans are read slice by slice and registered by one task
+    per slice; a run that was killed continues when called again. Tables of other scans or settings
+    in the same folder are removed, so that two data sets are never mixed.
+
+    Args:
+        store: the map.
+        log: an MCAP log with point clouds and poses.
+        out: folder of the tables: `errors/` (a row per sample point), `starts/` (a row per start),
+            a local path or any fsspec URL.
+        cell_size: edge of an NDT cell [m].
+        spacing: distance between sample points along the drive [m].
+        registration: the matcher; default `RegistrationSettings()`.
+        starts: the starts; default the paper's 317.
+        true_pose: `log`, or `refined` as the paper does.
+        scans: which scans to use; default all.
+        reading: how the log is read (topics, as if by a lesser sensor); its path is `log`.
+        starts_per_task: splits the starts of a slice over several tasks; None: all in one.
+        client: a Dask client to run on; None: this process.
+        memory: what a task may use [bytes].
+        watch: is told of each task that ended.
+
+    Returns:
+        A row per sample point in the order of the drive; `status` and `reason` say where none
+        could be measured.
+
+    Raises:
+        UsageError: settings that cannot be, a spacing that is not positive, no scan selected.
+        SourceError: the log cannot be read, has no clouds or no poses.
+        TileNotReadyError: no tile of the map within reach of the drive.
+        PlanError: a task does not fit `memory`.
+        PartialError: some tasks failed; the message lists them, the rest is done.
+    """
+    plan = plan_localize(
+        MapPlan.of_store(store),
+        replace(reading, path=os.fspath(log)) if reading else Reading(os.fspath(log)),
+        out,
+        cell_size=cell_size,
+        spacing=spacing,
+        registration=registration or RegistrationSettings(),
+        starts=starts or StartSettings(),
+        true_pose=true_pose,
+        scans=scans or ScanSelection(),
+        starts_per_task=starts_per_task,
+        memory=memory,
+    )
+    for stage in (register, label):
+        remove_others(paths_of(plan.outputs(stage.name)))
+    outcomes = execute(plan, client, watch)
+    failures = {outcome.key: outcome.reason for outcome in outcomes if not outcome.ok}
+    if failures:
+        raise PartialError(f"{out}: {len(failures)} tasks failed, the rest is done:", failures)
+    return read_tables(paths_of(plan.outputs(label.name)))
+
+
+def plan_localize(
+    map_plan: MapPlan,
+    reading: Reading,
+    out: str | os.PathLike[str],
+    *,
+    cell_size: float,
+    spacing: float,
+    registration: RegistrationSettings,
+    starts: StartSettings,
+    true_pose: TruePose,
+    scans: ScanSelection,
+    starts_per_task: int | None,
+    memory: int,
+    group: str = "",
+) -> Plan:
+    """What `localize` will run; arguments and errors as there.
+
+    Where a job has several logs, `group` names this one's labels: part of their keys and paths.
+    """
+    reading = replace(reading, path=str(Path(reading.path).absolute()))
+    log = reading.open()
+    samples = choose_samples(log, scans, spacing)
+    measuring = Measuring(cell_size, true_pose, registration, starts, reading.as_sensor)
+    for size in measuring.cell_sizes:
+        map_plan.store.grid.require_cell_size(whole_mm(size, "cell_size"))
+    state = reading.state
+    reach = (reading.range_max or REACH) + MARGIN
+    places = log.T_map_lidar[:, :2, 3]
+    if not tiles_in_reach(map_plan, places[[sample.scan for sample in samples]], reach):
+        x, y = places[samples[0].scan]
+        raise TileNotReadyError(
+            f"{map_plan.store.url}: no tile within {reach:g} m of {log.path}, which begins at "
+            f"({x:.1f}, {y:.1f}) m: is the log in the map's frame?"
+        )
+    tasks: list[Task] = []
+    for first in range(0, len(samples), SCANS_PER_TASK):
+        part = samples[first : first + SCANS_PER_TASK]
+        tasks += slice_tasks(
+            map_plan,
+            tiles_in_reach(map_plan, places[[sample.scan for sample in part]], reach),
+            DriveScans(reading, state, part),
+            measuring,
+            os.fspath(out),
+            group,
+            starts_per_task,
+        )
+    return Plan.of((*map_plan.tasks.values(), *tasks), memory)
+
+
+def choose_samples(log: ScanLog, scans: ScanSelection, spacing: float) -> tuple[Sample, ...]:
+    """One scan per `spacing` metres of the drive: the one nearest to each multiple of it.
+
+    Raises:
+        UsageError: `spacing` is not positive, or no scan with a pose is selected.
+    """
+    if not 0.0 < spacing < np.inf:
+        raise UsageError(f"spacing is {spacing!r}: give a positive length in metres")
+    chosen = scans.indices(log.stamps_ns)
+    chosen = chosen[log.posed[chosen]]
+    if not len(chosen):
+        raise UsageError(f"{log.path}: no scan with a pose is selected; {len(log)} scans are there")
+    steps = np.linalg.norm(np.diff(log.T_map_lidar[chosen, :3, 3], axis=0), axis=1)
+    arc = np.concatenate([[0.0], np.cumsum(steps)])
+    places = np.arange(0.0, arc[-1] + 0.5 * spacing, spacing)
+    after = np.clip(np.searchsorted(arc, places), 1, max(1, len(arc) - 1))
+    nearer = places - arc[after - 1] <= arc[np.minimum(after, len(arc) - 1)] - places
+    rows = np.unique(np.where(nearer, after - 1, np.minimum(after, len(arc) - 1)))
+    return tuple(
+        Sample(number, int(chosen[row]), int(log.stamps_ns[chosen[row]]), float(arc[row]))
+        for number, row in enumerate(rows)
+    )
+
+
+def tiles_in_reach(map_plan: MapPlan, places: Float64, reach: float) -> list[TileKey]:
+    """The tiles of the map within `reach` [m] of any of (k, 2) places, sorted."""
+    boxes = [Box.around(place[None], reach) for place in places]
+    return sorted({key for box in boxes for key in map_plan.over(box)})
+
+
+def slice_tasks(
+    map_plan: MapPlan,
+    keys: Sequence[TileKey],
+    scans: DriveScans,
+    measuring: Measuring,
+    folder: str,
+    group: str,
+    starts_per_task: int | None,
+) -> list[Task]:
+    """The register tasks of a slice of scans, and the label task that sums them up.
+
+    Args:
+        map_plan: the map.
+        keys: its tiles in reach of the slice.
+        scans: the slice.
+        measuring: what is measured with.
+        folder: of all tables.
+        group: which drive, as whose sensor; empty where a job has one only.
+        starts_per_task: starts of one task; None: all.
+    """
+    starts = len(start_poses(np.eye(4), measuring.starts))
+    size = starts if starts_per_task is None else starts_per_task
+    if size < 1:
+        raise UsageError(f"starts_per_task is {size}: give at least 1")
+    first = scans.samples[0]
+    name = "/".join(part for part in (group, f"{first.scan:06d}") if part)
+    key = "-".join(part for part in (group, str(first.number)) if part)
+    cells = [
+        map_plan.cells(tile, whole_mm(cell_size, "cell_size"))
+        for cell_size in measuring.cell_sizes
+        for tile in keys
+    ]
+    work = len(scans.samples)
+    registers = [
+        Task(
+            register,
+            f"{key}-{low}",
+            Parquet(f"{folder}/starts/{name}-{low:05d}.parquet"),
+            takes={"measuring": measuring, "batch": (low, min(low + size, starts))},
+            reads={"map_part": map_plan.part(keys, cells), "scans": scans},
+            work=work,
+            counts={"points": map_plan.count(keys)},
+        )
+        for low in range(0, starts, size)
+    ]
+    summed = Task(
+        label,
+        key,
+        Parquet(f"{folder}/errors/{name}.parquet"),
+        takes={"samples": scans.samples},
+        reads={"starts": tuple(task.product for task in registers)},
+        work=work,
+    )
+    return [*registers, summed]

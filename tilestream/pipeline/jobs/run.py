@@ -1,0 +1,410 @@
+"""The main job: a map and some drives in, the estimated error of every sample point out.
+
+```
+simulate? -> scatter -> merge, cells, terms, factors, surfels, observe, register, label   (measure)
+          -> samples -> train, evaluate -> importance, predict                            (estimate)
+          -> report
+```
+"""
+
+import json
+import os
+import platform
+import resource
+import shutil
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import joblib
+import numpy as np
+import yaml
+
+from tilestream.errors import PartialError, UsageError
+from tilestream.forest.dataset import Dataset
+from tilestream.forest.model_file import load_model
+from tilestream.pipeline.engine.attempt import Outcome
+from tilestream.pipeline.engine.cluster import report_kept
+from tilestream.pipeline.engine.costs import learn
+from tilestream.pipeline.engine.executor import Watch, execute
+from tilestream.pipeline.engine.plan import Plan, paths_of
+from tilestream.pipeline.engine.stage import Task
+from tilestream.pipeline.jobs.ingest import Reading
+from tilestream.pipeline.jobs.run_findings import Done, findings_of
+from tilestream.pipeline.jobs.run_inputs import Inputs, check_model, inputs_of, read_map
+from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
+from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
+from tilestream.pipeline.stages.map_plan import MapPlan
+from tilestream.pipeline.stages.samples import DatasetFile
+from tilestream.report import write_report
+from tilestream.report.summary import plain
+from tilestream.store import TileStore, open_store
+from tilestream.tables import remove_others
+from tilestream.version import VERSION
+
+WRITE_EVERY = 30.0
+"""How often `run.json` is written while tasks end [s]."""
+LARGE = 50_000
+"""Measured places from which on a forest is grown by all workers together."""
+
+
+@dataclass
+class _Book:
+    """What a run did so far; `run.json` is made from it."""
+
+    folder: Path
+    earlier: Mapping[str, Any] = field(default_factory=dict)
+    """What it said after the calls before this one."""
+    began: float = field(default_factory=time.time)
+    written: float = 0.0
+    tasks: list[Task] = field(default_factory=list)
+    outcomes: list[Outcome] = field(default_factory=list)
+    failures: dict[str, str] = field(default_factory=dict)
+    facts: dict[str, Any] = field(default_factory=dict)
+
+    def listening(self, watch: Watch | None) -> Watch:
+        """What enters outcomes as they come, and tells `watch` of them.
+
+        It is written now and then, so that a call that is killed has told what it cost.
+        """
+
+        def hear(outcome: Outcome, ended: int, total: int) -> None:
+            self.outcomes.append(outcome)
+            if not outcome.ok:
+                self.failures[outcome.key] = outcome.reason
+            if time.time() - self.written > WRITE_EVERY:
+                self.write("running")
+            if watch is not None:
+                watch(outcome, ended, total)
+
+        return hear
+
+    @contextmanager
+    def closed(self) -> Iterator[None]:
+        """Where the job ends early, by an error or Ctrl-C, that is written, and why."""
+        try:
+            yield
+        except BaseException as error:
+            self.facts["stopped_by"] = str(error) or type(error).__name__
+            with suppress(OSError):  # on a full disk the reason itself matters more
+                self.write("stopped")
+            raise
+
+    def write(self, state: str) -> dict[str, Any]:
+        """Write `run.json`: whole, or as it was."""
+        content = {
+            "state": state,
+            "tilestream": VERSION,
+            **machine(),
+            "began": datetime.fromtimestamp(self.began, UTC).isoformat(timespec="seconds"),
+            "seconds": round(time.time() - self.began, 1),
+            "calls": self.calls,
+            "seconds_of_all_calls": self.seconds(),
+            "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1000,
+            "stages": self.stages(),
+            "failures": self.failures,
+            **self.facts,
+        }
+        _write_text(self.folder / "run.json", json.dumps(content, indent=2, default=str) + "\n")
+        self.written = time.time()
+        return content
+
+    @property
+    def calls(self) -> int:
+        """How often the job was called on this run directory, this call included."""
+        return int(self.earlier.get("calls", 0)) + 1
+
+    def seconds(self) -> float:
+        """How long all calls took [s]."""
+        before = float(self.earlier.get("seconds_of_all_calls", 0.0))
+        return round(before + time.time() - self.began, 1)
+
+    def stages(self) -> dict[str, dict[str, float]]:
+        """Tasks, failures and work of each stage in this call; its core-seconds in all calls."""
+        work = {task.key: task.work for task in self.tasks}
+        nothing = {"tasks": 0, "failed": 0, "work": 0, "core_seconds": 0.0}
+        before: dict[str, Any] = self.earlier.get("stages", {})
+        order = dict.fromkeys([*before, *(task.stage for task in self.tasks)])
+        table = {
+            stage: nothing | {"core_seconds": before.get(stage, nothing)["core_seconds"]}
+            for stage in order
+        }
+        for outcome in self.outcomes:
+            row = table[outcome.stage]
+            row["tasks"] += 1
+            row["failed"] += not outcome.ok
+            row["work"] += work[outcome.key]
+            row["core_seconds"] = round(row["core_seconds"] + outcome.seconds, 3)
+        return table
+
+
+def run(
+    config: RunSettings | str | os.PathLike[str],
+    client: Any | None = None,
+    watch: Watch | None = None,
+) -> Path:
+    """The whole job: measure errors on drives, learn what the map says of them, estimate all.
+
+    Writes a run directory: `map.zarr/`, `tables/` (Parquet with documented columns: `factors`,
+    `observability`, `starts`, `errors`, `samples`, `judged`, `predictions`), `model.skops`,
+    `report/` (`index.html` and its data), `config.yaml` (the effective one), `run.json` (versions,
+    times over all calls, counts, failures). A job that was killed continues when it is called
+    again; what changed is redone with what depends on it.
+
+    Args:
+        config: the settings, or a YAML file of them.
+        client: a Dask client to run on; None: this process.
+        watch: is told of each task that ended.
+
+    Returns:
+        The run directory.
+
+    Raises:
+        UsageError: settings that cannot be.
+        SourceError, StoreError: an input that is not there or cannot be read.
+        ModelError: a model in use that does not fit the job, before anything runs; says what
+            differs.
+        PlanError: a task does not fit `memory`.
+        PartialError: some tasks failed; the message lists them, the rest is done and reported.
+    """
+    settings = config if isinstance(config, RunSettings) else read_settings(config)
+    check_model(settings)
+    book = _begin(settings)
+    with book.closed():
+        with report_kept(client, settings.folder / "dask-performance.html"):
+            inputs = inputs_of(settings, client, watch)
+            story = _Story(settings, inputs, book)
+            execute(story.first(), client, book.listening(watch), grow=story.grown)
+            if story.estimate is None:
+                story.estimate = story.plan_estimate()
+                _estimate_large(story.estimate, client, book.listening(watch))
+        learn(book.tasks, book.outcomes)
+        _report(settings, inputs, story, book)
+    book.write("failed" if book.failures else "done")
+    if book.failures:
+        raise PartialError(
+            f"{settings.out}: {len(book.failures)} tasks failed, the rest is done:", book.failures
+        )
+    return settings.folder
+
+
+def dataset(run_dir: str | os.PathLike[str]) -> Dataset:
+    """The factors and errors of the same places, as a run has joined them.
+
+    Args:
+        run_dir: a run directory.
+
+    Returns:
+        The dataset: `rows` (a pandas table: place, factors, labels), `columns` (the features),
+        `lost` (labels without a place, with reasons).
+
+    Raises:
+        SourceNotFoundError: no dataset there.
+    """
+    return DatasetFile(f"{os.fspath(run_dir)}/tables/samples/dataset.parquet").read()
+
+
+def _begin(settings: RunSettings) -> _Book:
+    """The run directory with the effective settings."""
+    try:
+        settings.folder.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise UsageError(
+            f"{settings.out} is a file, or below one: name another run directory"
+        ) from None
+    text = yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+    _write_text(settings.folder / "config.yaml", text)
+    book = _Book(settings.folder, _told_before(settings.folder / "run.json"))
+    book.write("running")
+    return book
+
+
+def _told_before(path: Path) -> dict[str, Any]:
+    """The book of earlier calls; empty where there is none, or none of this kind."""
+    try:
+        told = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    return told if isinstance(told, dict) and "calls" in told else {}
+
+
+def _write_text(path: Path, text: str) -> None:
+    part = path.with_name(f"{path.name}.part")
+    part.write_text(text)
+    part.replace(path)
+
+
+class _Story:
+    """The job as it goes on: what is known after each part decides what the next one is."""
+
+    def __init__(self, settings: RunSettings, inputs: Inputs, book: _Book) -> None:
+        self.settings = settings
+        self.inputs = inputs
+        self.book = book
+        self.reading: Reading | None = read_map(settings, inputs)
+        self.store: TileStore = (
+            self.reading.store if self.reading else open_store(settings.store_url)
+        )
+        self.measure = Plan((), settings.memory)
+        self.estimate: Plan | None = None
+        """None: not planned yet, or to be grown by all workers together."""
+        self._tiles: set[str] = set()
+        self._open: set[str] = set()
+
+    def first(self) -> Plan:
+        """What to run first: read the sources, or measure on the map that is there."""
+        tasks = self.reading.first().tasks if self.reading else ()
+        if not tasks:
+            self._close_map()
+            tasks = self._measured(MapPlan.of_store(self.store))
+        return Plan(self._known(tasks), self.settings.memory)
+
+    def grown(self, outcome: Outcome) -> tuple[Task, ...]:
+        """What is to be done now that a task has ended."""
+        merges = self.reading.grown(outcome) if self.reading else None
+        if merges is not None:
+            self._tiles = {task.key for task in merges}
+            if not merges:
+                self._close_map()  # which refuses sources without points
+            return self._known((*merges, *self._measured(MapPlan.of_merges(self.store, merges))))
+        if outcome.key in self._tiles:
+            self._tiles.remove(outcome.key)
+            if not self._tiles:
+                self._close_map()
+        self._open.discard(outcome.key)
+        if self._open or self._tiles or not self.measure.tasks or self.estimate is not None:
+            return ()
+        planned = self.plan_estimate()
+        if _is_large(planned):
+            return ()
+        self.estimate = planned
+        return self._known(planned.tasks)
+
+    def plan_estimate(self) -> Plan:
+        """What is learnt and estimated from what was measured."""
+        return plan_estimate(self.settings, self.store.grid, self.measure, self.book.outcomes)
+
+    def _close_map(self) -> None:
+        """Record what the map was made from, as soon as its last tile is written."""
+        if self.reading is not None:
+            self.book.failures |= self.reading.close(self.book.outcomes)
+
+    def _measured(self, map_plan: MapPlan) -> tuple[Task, ...]:
+        """The tasks that measure; tables of other settings are removed before."""
+        self.measure = plan_measure(self.settings, self.inputs, map_plan)
+        _remove_other_tables(self.settings, self.measure)
+        self._open = {task.key for task in self.measure.tasks}
+        return self.measure.tasks
+
+    def _known(self, tasks: tuple[Task, ...]) -> tuple[Task, ...]:
+        self.book.tasks += tasks
+        return tasks
+
+
+def _remove_other_tables(settings: RunSettings, measure: Plan) -> None:
+    """Remove the tables of other settings, so that two jobs are never mixed in one directory."""
+    by_folder: dict[str, list[str]] = {}
+    for path in paths_of(measure.tasks):
+        by_folder.setdefault(path.rsplit("/", 1)[0], []).append(path)
+    for paths in by_folder.values():
+        remove_others(paths)
+    for kind in ("errors", "starts"):
+        for folder in (settings.folder / "tables" / kind).glob("*/"):
+            if f"{settings.out}/tables/{kind}/{folder.name}" not in by_folder:
+                shutil.rmtree(folder)
+
+
+def _is_large(estimate: Plan) -> bool:
+    """Whether so many places were measured that all workers grow the forest together."""
+    places = sum(task.work for task in estimate.outputs("samples"))
+    return places >= LARGE and bool(estimate.outputs("train"))
+
+
+def _estimate_large(plan: Plan, client: Any | None, watch: Watch) -> None:
+    """Estimate with a forest that all workers grow together, through joblib: the same trees."""
+    first, trains = (Plan(plan.outputs(stage), plan.memory) for stage in ("samples", "train"))
+    outcomes = execute(first, client, watch)
+    if client is None:
+        outcomes += execute(trains, None, watch)
+    else:
+        with client.as_current(), joblib.parallel_config(backend="dask"):
+            outcomes += execute(trains, None, watch)
+    if all(outcome.ok for outcome in outcomes):
+        begun = {outcome.key for outcome in outcomes}
+        rest = tuple(task for task in plan.tasks if task.key not in begun)
+        execute(Plan(rest, plan.memory), client, watch)
+
+
+def _report(settings: RunSettings, inputs: Inputs, story: _Story, book: _Book) -> None:
+    """Gather what is done and write the report; without a single factor table there is none."""
+    good = {outcome.key for outcome in book.outcomes if outcome.ok}
+    done = Done(tuple(task for task in book.tasks if task.key in good))
+    if not done.outputs("factors"):
+        return
+    done.remove_other_tables()
+    known = done.dataset()
+    if known is not None:
+        book.facts |= {"labelled": len(known), "lost_labels": known.losses}
+    found, evaluation = findings_of(
+        settings.report.title or settings.folder.name,
+        done,
+        story.store,
+        known,
+        _facts(settings, inputs, book, known),
+        model=settings.model,
+    )
+    text = json.dumps(plain(evaluation), indent=1, allow_nan=False)
+    _write_text(settings.folder / "tables" / "evaluation.json", text + "\n")
+    write_report(found, settings.folder / "report", threshold=settings.report.threshold)
+    book.facts["report"] = str(settings.folder / "report" / "index.html")
+
+
+def _facts(
+    settings: RunSettings, inputs: Inputs, book: _Book, known: Dataset | None
+) -> dict[str, Any]:
+    """What a reader of the report must know of the run, and what makes the same figures again."""
+    stages = {name: f"{row['core_seconds']:.1f} s" for name, row in book.stages().items()}
+    effective = settings.model_dump(mode="json", exclude={"drives", "out"})
+    return {
+        **machine(),
+        "wall time, all calls [s]": book.seconds(),
+        "calls": book.calls,
+        "map": settings.store_url,
+        "sensor": settings.looking_sensor.name,
+        "labelled places": 0 if known is None else len(known),
+        "lost labels": {} if known is None else known.losses,
+        "model": _model_facts(settings, book),
+        "matcher": settings.label.registration.model_dump(),
+        "settings": effective,
+        "drives": {d.group: d.model_dump(exclude_defaults=True) for d in inputs.drives},
+        "core-seconds by stage, all calls": stages,
+        "failures": dict(book.failures),
+        "notes": list(inputs.notes),
+        "attributions": list(inputs.attributions),
+    }
+
+
+def machine() -> dict[str, Any]:
+    """What the figures were computed with."""
+    return {
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "scikit-learn": version("scikit-learn"),
+        "cores": os.cpu_count(),
+    }
+
+
+def _model_facts(settings: RunSettings, book: _Book) -> dict[str, Any]:
+    """Where the model comes from, and how it was grown."""
+    if settings.model.recipe == "physics":
+        return {"from": "none: the virtual drive as it is", "offset [m]": settings.model.offset}
+    if settings.model.use is not None:
+        return {"from": settings.model.use, **load_model(settings.model.use).facts}
+    if not any(outcome.stage == "train" and outcome.ok for outcome in book.outcomes):
+        return {"from": "none: it could not be trained", "recipe": settings.model.recipe}
+    return {"from": "trained here", **load_model(settings.folder / "model.skops").facts}

@@ -1,0 +1,208 @@
+"""What the main job found: the tables of a run directory, gathered for its report."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from tilestream.errors import ModelError
+from tilestream.forest.dataset import TARGETS, Dataset
+from tilestream.forest.evaluation import ceiling, factor_sets, figures_by_protocol
+from tilestream.forest.intervals import coverage
+from tilestream.forest.models import FORESTS
+from tilestream.forest.training import MAIN, PREDICTION_COLUMNS
+from tilestream.pipeline.engine.plan import paths_of
+from tilestream.pipeline.engine.stage import Task
+from tilestream.pipeline.jobs.run_settings import ModelSettings
+from tilestream.pipeline.stages.evaluate import by_protocol
+from tilestream.pipeline.stages.samples import places_with_factors
+from tilestream.records import Float64
+from tilestream.report.findings import AROUND, Findings
+from tilestream.store import TileStore
+from tilestream.tables import read_tables, remove_others
+from tilestream.tiling import MM_PER_M, Box
+
+PLACE = ["route_id", "sample"]
+_NO_POINTS = pd.DataFrame(
+    {"path": pd.Series(dtype=str)}
+    | {name: pd.Series(dtype=np.float64) for name in ("arc_length", "estimate")}
+)
+"""Where nothing could be held out."""
+
+
+@dataclass(frozen=True)
+class Done:
+    """The tasks of a run that are done."""
+
+    tasks: tuple[Task, ...]
+
+    def outputs(self, stage: str) -> tuple[Task, ...]:
+        """Those of a stage."""
+        return tuple(task for task in self.tasks if task.stage == stage)
+
+    def dataset(self) -> Dataset | None:
+        """The joined dataset; None: nothing was measured, or it could not be joined."""
+        joined = self.outputs("samples")
+        return joined[0].writes.read() if joined else None
+
+    def judgements(self) -> dict[tuple[str, str, str], dict[str, pd.DataFrame | str]]:
+        """What was evaluated, by (target, competitor, factor set; empty: all factors)."""
+        return {
+            (t.takes["target"], t.takes["competitor"], t.takes["factor_set"]): by_protocol(
+                t.writes.read()
+            )
+            for t in self.outputs("evaluate")
+        }
+
+    def remove_other_tables(self) -> None:
+        """Remove the evaluations and estimates of other settings."""
+        for stages in (("evaluate", "importance"), ("predict",)):
+            paths = paths_of(task for stage in stages for task in self.outputs(stage))
+            if paths:
+                remove_others(paths)
+
+
+def places_of(done: Done) -> pd.DataFrame:
+    """Every sample point with its factors and its estimate, or why it has none."""
+    factors, observed = (
+        [task.writes.read() for task in done.outputs(stage)] for stage in ("factors", "observe")
+    )
+    places = places_with_factors(factors, observed).drop(columns=["status", "reason"])
+    tables = paths_of(done.outputs("predict"))
+    names = [column.name for column in PREDICTION_COLUMNS]
+    if tables:
+        found = read_tables(tables)[[*PLACE, *names]]
+    else:
+        found = pd.DataFrame(columns=[*PLACE, *names])
+    joined = places.merge(found, on=PLACE, how="left", validate="one_to_one")
+    lost = joined["status"].isna()
+    joined["in_domain"] = joined["in_domain"].astype("boolean")
+    joined.loc[lost, "status"] = "failed"
+    joined.loc[lost, "reason"] = "no estimate: its task failed, see run.json"
+    dtypes = {c.name: c.dtype for c in PREDICTION_COLUMNS if c.dtype == "float64"}
+    return joined.astype(dtypes)
+
+
+def labels_of(
+    dataset: Dataset | None, places: pd.DataFrame, points: pd.DataFrame | None
+) -> pd.DataFrame:
+    """The measured places, with what a model said of them that had not seen them.
+
+    Args:
+        dataset: what was measured.
+        places: every sample point.
+        points: held-out points of the model that leaves paths out; None: the model in use was
+            trained elsewhere, so that its estimates are held out as they are.
+    """
+    if dataset is None:
+        return pd.DataFrame()
+    if points is None:
+        said = places.rename(columns={"route_id": "path", "estimate": "held_out"})
+    else:
+        said = points.rename(columns={"estimate": "held_out"})
+    kept = ["held_out"] if points is not None else ["held_out", "low", "high"]
+    said = said[["path", "arc_length", *kept]]
+    return dataset.rows.merge(said, on=["path", "arc_length"], how="left", validate="many_to_one")
+
+
+def evaluation_of(
+    found: Mapping[tuple[str, str, str], Mapping[str, pd.DataFrame | str]],
+    sets: Sequence[str],
+    recipe: str,
+) -> dict[str, pd.DataFrame]:
+    """Judgements as tables: `protocols`, `table_iv`, `coverage`, and `parts` for other targets.
+
+    Args:
+        found: what was judged (`Done.judgements`).
+        sets: the factor sets of Table IV in its order; the last has all factors.
+        recipe: the model whose intervals are checked.
+    """
+    rows = {key: figures_by_protocol(judgement, key[1]) for key, judgement in found.items()}
+    protocols = [
+        table for (target, _, chosen), table in rows.items() if (target, chosen) == (MAIN, "")
+    ]
+    judged_as = {name: "" if name == sets[-1] else name for name in sets}
+    four = [
+        rows[MAIN, model, chosen].assign(factors=name)
+        for model in FORESTS
+        for name, chosen in judged_as.items()
+        if (MAIN, model, chosen) in rows
+    ]
+    parts = [table.assign(target=t) for (t, _, _), table in rows.items() if t != MAIN]
+    held = found.get((MAIN, recipe, ""), {}).get("path", "")
+    return {
+        "protocols": _joined(protocols),
+        "table_iv": _joined(four),
+        "parts": _joined(parts),
+        "coverage": pd.DataFrame() if isinstance(held, str) else coverage(held),
+    }
+
+
+def _joined(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
+
+
+def ceilings(dataset: Dataset | None, targets: Sequence[str]) -> dict[str, dict[str, float]]:
+    """What a repeated drive knows of each target; empty without one."""
+    found: dict[str, dict[str, float]] = {}
+    for target in targets:
+        if dataset is not None and target in dataset.rows:
+            try:
+                found[target] = asdict(ceiling(dataset, target))
+            except ModelError:
+                return {}
+    return found
+
+
+def findings_of(
+    title: str,
+    done: Done,
+    store: TileStore,
+    dataset: Dataset | None,
+    facts: Mapping[str, Any],
+    *,
+    model: ModelSettings,
+) -> tuple[Findings, dict[str, Any]]:
+    """All that the report tells, and the figures of the evaluation for machines.
+
+    Held-out estimates are those of the model's own recipe, and there are none where no path could
+    be left out; of a model that was not trained on these labels all estimates are held out as they
+    are.
+    """
+    places, found = places_of(done), done.judgements()
+    sets = [] if dataset is None else list(factor_sets(dataset.columns))
+    tables = evaluation_of(found, sets, model.recipe)
+    held = found.get((MAIN, model.recipe, ""), {}).get("path")
+    points = held if isinstance(held, pd.DataFrame) else _NO_POINTS
+    weights = paths_of(done.outputs("importance"))
+    weighed = read_tables(weights) if weights else pd.DataFrame({"factor": []})
+    ceiling_of = ceilings(dataset, TARGETS)
+    trained_here = model.use is None and model.recipe != "physics"
+    gathered = Findings(
+        title=title,
+        places=places,
+        labels=labels_of(dataset, places, points if trained_here else None),
+        protocols=tables["protocols"],
+        table_iv=tables["table_iv"],
+        importances=weighed[weighed["factor"] != ""].reset_index(drop=True),
+        criterion_importances=weighed[weighed["factor"] == ""].reset_index(drop=True),
+        coverage=tables["coverage"],
+        parts=tables["parts"],
+        ceilings=ceiling_of,
+        model="" if model.use else model.recipe,
+        facts=dict(facts),
+        crs=store.settings.crs,
+        around=lambda x, y, _: points_around(store, x, y, AROUND),
+    )
+    evaluation = {name: table.to_dict("records") for name, table in tables.items()}
+    return gathered, evaluation | {"ceilings": ceiling_of}
+
+
+def points_around(store: TileStore, x: float, y: float, reach: float) -> Float64:
+    """The map points within a square of 2 `reach` around a place, (n, 3) [m]."""
+    points = store.points_in(Box.around(np.array([[x, y]]), reach)) / MM_PER_M
+    near = (np.abs(points[:, :2] - (x, y)) <= reach).all(axis=1)
+    kept: Float64 = points[near]
+    return kept

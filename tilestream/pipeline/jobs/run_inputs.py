@@ -1,0 +1,252 @@
+"""What the main job works on: its settings and files."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from glob import glob
+from pathlib import Path
+from typing import Any
+
+from tilestream.config import IngestSettings
+from tilestream.errors import ModelError, SourceNotFoundError, UsageError
+from tilestream.factors.virtual_scan import VirtualSettings
+from tilestream.forest.dataset import made_with
+from tilestream.forest.model_file import load_model
+from tilestream.forest.training import check_making
+from tilestream.formats.mcap import ScanSelection
+from tilestream.formats.routes import read_routes
+from tilestream.pipeline.engine.executor import Watch
+from tilestream.pipeline.jobs.ingest import Reading, read_sources
+from tilestream.pipeline.jobs.run_settings import DriveSettings, RunSettings, SimulateSettings
+from tilestream.pipeline.jobs.simulate import simulate
+from tilestream.pipeline.stages.drive_scans import Reading as DriveReading
+from tilestream.pipeline.stages.observe import Observing
+from tilestream.pipeline.stages.samples import COLUMNS
+from tilestream.records import Route
+from tilestream.simulation.settings import SimulationSettings, load_preset
+from tilestream.store import open_store
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What the main job works on, whether simulated or real."""
+
+    sources: tuple[str, ...]
+    """What the map is made from; empty: a store that is there."""
+    drives: tuple[DriveSettings, ...]
+    """The logs to measure on."""
+    routes: tuple[Route, ...]
+    """Where to estimate."""
+    notes: tuple[str, ...] = ()
+    """What a reader of the results must know."""
+    attributions: tuple[str, ...] = ()
+    """Whose data it is."""
+
+
+def inputs_of(settings: RunSettings, client: Any | None, watch: Watch | None) -> Inputs:
+    """The files of a job; a simulated city is simulated first, as far as it is not there.
+
+    Raises:
+        UsageError: no routes, or two of one name.
+        SourceError: a file that is not there or cannot be read.
+    """
+    if settings.simulate is None:
+        drives = settings.drives
+        files = settings.routes or tuple(dict.fromkeys(drive.log for drive in drives))
+        if not files:
+            return Inputs(settings.map.sources, drives, *_all_streets(settings))
+        return Inputs(settings.map.sources, drives, _routes(files, settings))
+    folder = simulated_folder(settings)
+    wanted = settings.simulate
+    for drive in simulations(wanted):
+        simulate(drive, folder, **extent(wanted), client=client, watch=watch)
+    logs = [
+        DriveSettings(log=str(log), name=f"drive{drive}-{log.stem}")
+        for drive in range(wanted.drives)
+        for log in sorted((folder / "logs" / f"drive{drive}").glob("*.mcap"))
+        if wanted.paths is None or log.stem in wanted.paths
+    ]
+    preset = load_preset(wanted.preset)
+    routes = _routes(settings.routes or (str(folder / "routes.geojson"),), settings)
+    if wanted.paths is not None and not settings.routes:
+        routes = tuple(route for route in routes if route.route_id in wanted.paths)
+    return Inputs(
+        settings.map.sources or (str(folder / "survey" / "*.laz"),),
+        settings.drives or tuple(logs),
+        routes,
+        notes=(f"Simulated, preset {preset.preset}: {preset.note}",),
+        attributions=(ATTRIBUTION,),
+    )
+
+
+def simulations(wanted: SimulateSettings) -> list[SimulationSettings]:
+    """The experiment of each drive."""
+    preset = load_preset(wanted.preset).model_copy(update={"seed": wanted.seed})
+    return [preset.model_copy(update={"drive": drive}) for drive in range(wanted.drives)]
+
+
+def extent(wanted: SimulateSettings) -> dict[str, Any]:
+    """How much of the city is simulated, as `simulate` and its plan take it."""
+    return {
+        "paths": wanted.paths,
+        "scans_per_point": wanted.scans_per_point,
+        "size": wanted.size,
+    }
+
+
+ATTRIBUTION = (
+    "Building footprints: MLIT Project PLATEAU by way of indigo-lab/plateau-lod2-mvt, clipped, "
+    "CC BY 4.0."
+)
+
+
+def simulated_folder(settings: RunSettings) -> Path:
+    """Where a simulated city is kept."""
+    assert settings.simulate is not None
+    return Path(settings.simulate.folder or settings.folder / "simulation")
+
+
+LANES = "lanelet2_map.osm"
+"""The lanes that Autoware keeps beside the point clouds of a map."""
+
+
+def _all_streets(settings: RunSettings) -> tuple[tuple[Route, ...], tuple[str, ...]]:
+    """The lanes of the map directories among the sources, and what is to be told of them.
+
+    Raises:
+        UsageError: there are none, or none as long as the spacing.
+    """
+    found = [Path(name) for source in settings.map.sources for name in sorted(glob(source))]  # noqa: PTH207
+    files = [str(place / LANES) for place in found if (place / LANES).is_file()]
+    if not files:
+        raise UsageError(
+            f"{settings.out}: no routes: give files of routes, drives, or a map directory with "
+            f"{LANES} in map.sources"
+        )
+    lanes = _routes(files, settings)
+    long = tuple(lane for lane in lanes if lane.arc_length[-1] >= settings.spacing)
+    if not long:
+        raise UsageError(
+            f"{settings.out}: no routes: all {len(lanes)} lanes of {', '.join(files)} are shorter "
+            f"than the spacing, {settings.spacing:g} m"
+        )
+    told = f"no routes were given: all streets of the map, {len(long)} lanes of {', '.join(files)}"
+    short = len(lanes) - len(long)
+    return long, (told + (f"; {short} shorter than the spacing are left out" if short else ""),)
+
+
+def _routes(files: Sequence[str], settings: RunSettings) -> tuple[Route, ...]:
+    found = [r for path in files for r in read_routes(path, project_to=settings.project_to)]
+    names = [route.route_id for route in found]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise UsageError(f"two routes are named {', '.join(twice)}: give each its own name")
+    return tuple(found)
+
+
+def read_map(settings: RunSettings, inputs: Inputs) -> Reading | None:
+    """The map's sources, to be read; None: the store that is there is the map.
+
+    Raises:
+        SourceError, PlanError: as `ingest`.
+    """
+    if not inputs.sources:
+        return None
+    return read_sources(
+        inputs.sources,
+        settings.store_url,
+        ingest_settings(settings),
+        settings.memory,
+        settings.map.points_topic,
+        settings.map.pose_topic,
+        map_scans(settings, inputs),
+    )
+
+
+def ingest_settings(settings: RunSettings) -> IngestSettings:
+    """How the map is cut into tiles."""
+    names = set(IngestSettings.model_fields)
+    return IngestSettings(**settings.map.model_dump(include=names))
+
+
+def map_scans(settings: RunSettings, inputs: Inputs) -> ScanSelection | None:
+    """Which scans of logs become the map; None: there are no logs among the sources."""
+    if any(source.lower().endswith(".mcap") for source in inputs.sources):
+        return ScanSelection(every=settings.map.every, offset=settings.map.offset)
+    return None
+
+
+def is_simulated(settings: RunSettings) -> bool:
+    """Whether the simulated city is there, every drive of it."""
+    assert settings.simulate is not None
+    folder = simulated_folder(settings)
+    drives = [folder / "logs" / f"drive{drive}" for drive in range(settings.simulate.drives)]
+    return (folder / "routes.geojson").exists() and all(any(d.glob("*.mcap")) for d in drives)
+
+
+def observing_of(settings: RunSettings, seeing: VirtualSettings) -> Observing:
+    """What the virtual drive is made with: the vehicle's lidar and its matcher."""
+    return Observing(
+        settings.looking_sensor,
+        seeing,
+        settings.label.registration,
+        settings.cell_size,
+        settings.sensor_height,
+    )
+
+
+def making_of(settings: RunSettings) -> dict[str, Any]:
+    """What the factors are made with, as a model remembers it."""
+    making = made_with(COLUMNS, settings.looking_sensor, settings.cell_size)
+    making |= {"sensor_height": settings.sensor_height, "map_leaf": _map_leaf(settings)}
+    if settings.observe is None:
+        return making
+    return making | {
+        "seeing": settings.observe.model_dump(mode="json"),
+        "matcher": settings.label.registration.model_dump(mode="json"),
+    }
+
+
+def _map_leaf(settings: RunSettings) -> float:
+    """How the map is thinned that the job makes, or was thinned that is there [m]."""
+    if settings.map.sources or settings.simulate is not None:
+        return settings.map.map_leaf
+    return open_store(settings.store_url).settings.map_leaf
+
+
+def check_model(settings: RunSettings) -> None:
+    """Refuse a model in use that cannot estimate these places, before anything is made or measured.
+
+    Raises:
+        SourceNotFoundError: there is no such file.
+        ModelError: the file is no model, or the model was trained for other factors; says which.
+        StoreNotFoundError: the map is to be there and is not.
+    """
+    if settings.model.use is None:
+        return
+    if not Path(settings.model.use).is_file():
+        raise SourceNotFoundError(f"{settings.model.use}: no such model file; see model.use")
+    try:
+        check_making(load_model(settings.model.use), making_of(settings))
+    except ModelError as error:
+        told = str(error).removeprefix(f"{settings.model.use}: ")
+        raise ModelError(f"{settings.model.use}: {told}") from None
+
+
+def reading_of(drive: DriveSettings) -> DriveReading:
+    """How a drive's log is read.
+
+    Raises:
+        SourceNotFoundError: there is no such log.
+    """
+    if not Path(drive.log).is_file():
+        raise SourceNotFoundError(f"{drive.log}: no such log; see drives in the config")
+    return DriveReading(
+        drive.log,
+        drive.points_topic,
+        drive.pose_topic,
+        drive.beams,
+        drive.range_max,
+        drive.blind_rear_deg,
+        drive.deskew or drive.sweep_s is not None,
+        drive.sweep_s,
+    )

@@ -1,0 +1,235 @@
+"""What the main job runs: tiles, factors and errors; then what is learnt of them."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from tilestream.factors import catalogue
+from tilestream.factors.rows import samples_by_tile
+from tilestream.factors.virtual_drive import NEIGHBOURS
+from tilestream.forest.dataset import TARGETS, features_of
+from tilestream.forest.evaluation import factor_sets
+from tilestream.forest.models import COMPETITORS, PHYSICS
+from tilestream.forest.training import MAIN
+from tilestream.formats.mcap import ScanSelection
+from tilestream.pipeline.engine.attempt import Outcome
+from tilestream.pipeline.engine.outputs import Parquet
+from tilestream.pipeline.engine.plan import Plan
+from tilestream.pipeline.engine.stage import Readable, Task
+from tilestream.pipeline.jobs.along_routes import plan_factors, plan_observe
+from tilestream.pipeline.jobs.localize import plan_localize
+from tilestream.pipeline.jobs.run_inputs import Inputs, making_of, observing_of, reading_of
+from tilestream.pipeline.jobs.run_settings import RunSettings
+from tilestream.pipeline.stages.evaluate import evaluate
+from tilestream.pipeline.stages.factors import Looking
+from tilestream.pipeline.stages.importance import importance
+from tilestream.pipeline.stages.map_plan import MapPlan
+from tilestream.pipeline.stages.predict import predict
+from tilestream.pipeline.stages.samples import COLUMNS, DatasetFile, samples
+from tilestream.pipeline.stages.train import ModelFile, ModelInUse, train
+from tilestream.tiling import MM_PER_M, TileGrid, TileKey
+
+OPPONENT = "training median"
+"""Whom a part of the error is judged against: the others know no more of unseen paths."""
+NEIGHBOURS_MM = round(NEIGHBOURS * MM_PER_M) + 1
+"""How far from a tile a sample point of it may have neighbours, rounding included [mm]."""
+
+
+def plan_measure(settings: RunSettings, inputs: Inputs, map_plan: MapPlan) -> Plan:
+    """Factors and errors: every task needs only the tiles around it.
+
+    Args:
+        settings: the job.
+        inputs: its files.
+        map_plan: the map, as far as it is there or will be.
+    """
+    tables = f"{settings.out}/tables"
+    looking = Looking(settings.looking_sensor, settings.cell_size, "all", settings.sensor_height)
+    places = samples_by_tile(map_plan.store.grid, inputs.routes, settings.spacing)
+    memory = settings.memory
+    plans = [plan_factors(map_plan, places, tables, looking, memory)]
+    if settings.observe is not None:
+        observing = observing_of(settings, settings.observe)
+        plans.append(plan_observe(map_plan, places, tables, observing, memory))
+    for drive in inputs.drives:
+        scans = ScanSelection(
+            every=drive.every, offset=drive.offset, from_s=drive.from_s, until_s=drive.until_s
+        )
+        plans.append(
+            plan_localize(
+                map_plan,
+                reading_of(drive),
+                tables,
+                cell_size=settings.cell_size,
+                spacing=settings.spacing,
+                registration=settings.label.registration,
+                starts=settings.label.starts,
+                true_pose=settings.label.true_pose,
+                scans=scans,
+                starts_per_task=None,
+                memory=memory,
+                group=drive.group,
+            )
+        )
+    return Plan.of((task for plan in plans for task in plan.tasks), memory)
+
+
+def plan_estimate(
+    settings: RunSettings, grid: TileGrid, measure: Plan, outcomes: Sequence[Outcome]
+) -> Plan:
+    """Samples, evaluate, train, predict: from what was measured.
+
+    What failed is left out here and listed by the run, so that a tile that cannot be read does not
+    keep the rest of the city from its estimates. A tile whose virtual drive failed is left out too:
+    nothing is learnt or estimated without it where it was asked for.
+    """
+    done = {outcome.key for outcome in outcomes if outcome.ok}
+    factors, observed, labels = (
+        [task for task in measure.outputs(stage) if task.key in done]
+        for stage in ("factors", "observe", "label")
+    )
+    if settings.observe is not None:
+        seen = {task.tile for task in observed}
+        factors = [task for task in factors if task.tile in seen]
+    tasks: list[Task] = []
+    known, model = _model_there(settings)
+    if labels and factors:
+        joined = _samples(settings, factors, observed, labels)
+        tasks.append(joined)
+        if not known:
+            training = _training(settings, joined)
+            known, model = True, training.product
+            tasks += [training, *_evaluations(settings, joined, bool(observed))]
+            tasks.append(_importance(settings, joined, training))
+    if known:
+        tasks += _predictions(settings, grid, factors, observed, model)
+    return Plan.of(tasks, settings.memory)
+
+
+def _model_there(settings: RunSettings) -> tuple[bool, Readable | None]:
+    """Whether nothing has to be trained, and the model in use; None: the virtual drive as it is."""
+    if settings.model.recipe == "physics":
+        return True, None
+    if settings.model.use is None:
+        return False, None
+    return True, ModelInUse.of(settings.model.use)
+
+
+def _samples(
+    settings: RunSettings,
+    factors: Sequence[Task],
+    observed: Sequence[Task],
+    labels: Sequence[Task],
+) -> Task:
+    return Task(
+        samples,
+        "dataset",
+        DatasetFile(f"{settings.out}/tables/samples/dataset.parquet"),
+        takes={
+            "groups": tuple(_group(task) for task in labels),
+            "making": making_of(settings),
+        },
+        reads={
+            "factors": _products(factors),
+            "observed": _products(observed),
+            "labels": _products(labels),
+        },
+        work=sum(task.work for task in labels),
+        counts={"places": sum(task.work for task in (*factors, *labels))},
+    )
+
+
+def _group(label: Task) -> str:
+    """Of which drive, as whose sensor, a label task is: the folder of its table."""
+    assert isinstance(label.writes, Parquet)
+    return label.writes.path.rsplit("/", 2)[1]
+
+
+def _products(tasks: Iterable[Task]) -> tuple[Readable, ...]:
+    return tuple(task.product for task in tasks)
+
+
+def _training(settings: RunSettings, joined: Task) -> Task:
+    return Task(
+        train,
+        "model",
+        ModelFile(str(settings.folder / "model.skops")),
+        takes={"recipe": settings.model.recipe, "seed": settings.model.seed},
+        reads={"dataset": joined.product},
+        counts=joined.counts,
+    )
+
+
+def _evaluations(settings: RunSettings, joined: Task, observed: bool) -> list[Task]:
+    """Every model and opponent on all factors, the forests on each set of Table IV; the parts of
+    the error by the forest in use, the virtual drive and the training median.
+    """
+    folder, model = f"{settings.out}/tables/judged", settings.model
+    columns = features_of(COLUMNS if observed else catalogue.COLUMNS)
+    *sets, _ = factor_sets(columns)  # the last has all factors, as the competitors have
+    known = [name for name in COMPETITORS if observed or name not in PHYSICS]
+    wanted = [(MAIN, competitor, "") for competitor in known]
+    wanted += [(MAIN, "paper", name) for name in sets]
+    wanted += [(MAIN, "default", name) for name in sets if "LS" in name and "ob" not in name]
+    of_parts = [model.recipe, *(name for name in known if name in PHYSICS), OPPONENT]
+    wanted += [(target, name, "") for target in TARGETS if target != MAIN for name in of_parts]
+    tasks = []
+    for target, competitor, factor_set in wanted:
+        name = f"{target}-{competitor}-{factor_set or 'all'}".replace(" ", "_")
+        takes = {"target": target, "competitor": competitor, "factor_set": factor_set}
+        tasks.append(
+            Task(
+                evaluate,
+                name,
+                Parquet(f"{folder}/{name}.parquet"),
+                takes={**takes, "seed": model.seed},
+                reads={"dataset": joined.product},
+                counts=joined.counts,
+            )
+        )
+    return tasks
+
+
+def _importance(settings: RunSettings, joined: Task, training: Task) -> Task:
+    return Task(
+        importance,
+        "factors",
+        Parquet(f"{settings.out}/tables/judged/weights.parquet"),
+        takes={"seed": settings.model.seed},
+        reads={"dataset": joined.product, "model": training.product},
+        counts=joined.counts,
+    )
+
+
+def _predictions(
+    settings: RunSettings,
+    grid: TileGrid,
+    factors: Sequence[Task],
+    observed: Sequence[Task],
+    model: Readable | None,
+) -> list[Task]:
+    """A task per tile, which reads the observability of the neighbours of its sample points too."""
+    of_tile = {task.tile: task for task in observed}
+    making = making_of(settings)
+    reads: dict[str, Any] = {} if model is None else {"model": model}
+    tasks = []
+    for task in factors:
+        assert task.tile is not None
+        near = [of_tile[key] for key in _around(grid, task.tile) if key in of_tile]
+        tasks.append(
+            Task(
+                predict,
+                str(task.tile),
+                Parquet(f"{settings.out}/tables/predictions/{task.tile}.parquet"),
+                takes={"making": making, "offset": settings.model.offset},
+                reads={**reads, "factors": task.product, "observed": _products(near)},
+                work=task.work,
+                counts={"places": sum(one.work for one in (task, *near))},
+                tile=task.tile,
+            )
+        )
+    return tasks
+
+
+def _around(grid: TileGrid, tile: TileKey) -> Iterable[TileKey]:
+    """The tiles whose sample points may be neighbours of a tile's."""
+    return grid.keys_over(grid.core(tile).grown(NEIGHBOURS_MM))

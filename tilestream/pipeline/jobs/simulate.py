@@ -1,0 +1,305 @@
+"""Simulate a city: survey blocks and drive logs, in tasks per stretch of street."""
+
+import hashlib
+import json
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import yaml
+
+from tilestream.errors import PartialError, PlanError, UsageError
+from tilestream.formats.rows import writing_whole
+from tilestream.pipeline.engine.executor import Watch, execute
+from tilestream.pipeline.engine.plan import Plan
+from tilestream.pipeline.engine.stage import Task
+from tilestream.pipeline.stages.simulated import (
+    DriveLog,
+    ScanParts,
+    SimulatedCity,
+    SurveyBlock,
+    log,
+    scan,
+    survey,
+)
+from tilestream.simulation.city import City, data_file, stretches
+from tilestream.simulation.drive import motion_of
+from tilestream.simulation.settings import SimulationSettings
+from tilestream.simulation.streets import Street, check_clear, read_streets, street_called
+from tilestream.version import VERSION
+
+STRETCH = 50
+"""Sample points of a stretch: a task's worth."""
+SMALL_POINTS, SMALL_RAYS = 40, 4_000
+"""Of `size="small"`: sample points of each path, rays per metre of the survey."""
+BYTES_PER_RAY, BYTES_PER_SCAN = 4, 400_000
+"""On disk, generously: of a survey, and of a scan while it waits for its log [bytes]."""
+RECORD, ROUTES = "simulation.yaml", "routes.geojson"
+"""Files that say what was simulated, and where its streets run."""
+SIMULATION_VERSION = 1
+"""Raised when the code of the simulation changes what it writes."""
+
+Size = Literal["full", "small"]
+"""How much of each path."""
+
+
+def simulate(
+    settings: SimulationSettings,
+    out: str | Path,
+    *,
+    paths: Sequence[str] | None = None,
+    scans_per_point: int = 1,
+    size: Size = "full",
+    client: Any | None = None,
+    watch: Watch | None = None,
+) -> Path:
+    """Simulate a survey of a city and drives through it.
+
+    Writes `survey/*.laz` (the map, in blocks), `logs/drive<k>/<path>.mcap` (PointCloud2, Odometry,
+    the true poses on `/ground_truth`), `routes.geojson` and `simulation.yaml` (the settings). The
+    same settings give the same bytes, in this process or on any number of workers. What is there
+    already is kept; another `drive` of the same city adds its logs.
+
+    Args:
+        settings: the experiment.
+        out: the directory to write to.
+        paths: the streets to simulate, by name; None: all, of which the driven ones are scanned.
+        scans_per_point: turns of the lidar kept at each sample point.
+        size: `small`: the first 40 m of each path and a thin survey, for demonstrations and tests.
+        client: a Dask client to run on; None: this process.
+        watch: is told of each task that ended.
+
+    Returns:
+        The directory.
+
+    Raises:
+        UsageError: an unknown path, a route through a building, or a directory that holds another
+            simulation.
+        PlanError: not enough space on the disk.
+        PartialError: some tasks failed; the message lists them, the rest is there.
+    """
+    folder = Path(out)
+    plan = plan_simulation(
+        settings, folder, paths=paths, scans_per_point=scans_per_point, size=size
+    )
+    settings = _sized(settings, size)
+    identity = _identity(settings, scans_per_point, size)
+    _require_same(folder, identity)
+    require_space(folder, _bytes_needed(plan))
+    city = SimulatedCity(settings.model_dump_json()).read()
+    for street in city.streets:
+        check_clear(street, city.footprints)
+    _begin(folder, city, identity)
+    outcomes = execute(plan, client, watch)
+    failures = {outcome.key: outcome.reason for outcome in outcomes if not outcome.ok}
+    if failures:
+        raise PartialError(f"{folder}: {len(failures)} tasks failed, the rest is done:", failures)
+    shutil.rmtree(folder / "parts", ignore_errors=True)
+    return folder
+
+
+def plan_simulation(
+    settings: SimulationSettings,
+    out: str | Path,
+    *,
+    paths: Sequence[str] | None = None,
+    scans_per_point: int = 1,
+    size: Size = "full",
+) -> Plan:
+    """What `simulate` will run: surveys and scans of every stretch, then a log per driven street.
+
+    Only the routes are read; no city is built and nothing is written. Arguments and errors as
+    there.
+    """
+    if scans_per_point < 1 or scans_per_point > 64:
+        raise UsageError(f"scans_per_point is {scans_per_point}: give 1 to 64")
+    folder, settings = Path(out), _sized(settings, size)
+    city = SimulatedCity(settings.model_dump_json())
+    streets = read_streets(data_file(settings.city.routes))
+    if paths is not None:
+        streets = tuple(street_called(streets, name) for name in paths)
+    tasks: list[Task] = []
+    logs: list[Task] = []
+    for street in streets:
+        end = len(street.xy) if size == "full" else min(len(street.xy), SMALL_POINTS)
+        pieces = [(b, min(e, end)) for b, e in stretches(street, STRETCH) if b < end]
+        for passes in range(settings.survey.passes):
+            tasks += [_survey(city, settings, folder, street, piece, passes) for piece in pieces]
+        drive = _drive(city, settings, folder, street, pieces, scans_per_point)
+        tasks += drive[:-1]
+        logs += drive[-1:]
+    largest = max((task.promised_bytes for task in (*tasks, *logs)), default=0)
+    return Plan.of((*tasks, *logs), largest)
+
+
+def _survey(
+    city: SimulatedCity,
+    settings: SimulationSettings,
+    folder: Path,
+    street: Street,
+    stretch: tuple[int, int],
+    passes: int,
+) -> Task:
+    """One pass of the survey along a stretch."""
+    points = stretch[1] - stretch[0]
+    return Task(
+        survey,
+        f"{street.name}-{passes}-{stretch[0]}",
+        SurveyBlock(str(folder / "survey" / f"{street.name}_{passes}_{stretch[0]:05d}.laz")),
+        takes={"street": street.name, "stretch": stretch, "passes": passes},
+        reads={"city": city},
+        work=points,
+        counts={"rays": points * settings.survey.rays_per_m},
+    )
+
+
+def _drive(
+    city: SimulatedCity,
+    settings: SimulationSettings,
+    folder: Path,
+    street: Street,
+    pieces: Sequence[tuple[int, int]],
+    scans_per_point: int,
+) -> list[Task]:
+    """The scans of a drive along a street, then its log; nothing where that is there."""
+    path = folder / "logs" / f"drive{settings.drive}" / f"{street.name}.mcap"
+    if not street.driven or path.exists():
+        return []
+    takes = {"street": street.name, "scans_per_point": scans_per_point}
+    parts = [
+        Task(
+            scan,
+            f"{street.name}-{begin}",
+            ScanParts(
+                str(folder / "parts" / f"drive{settings.drive}_{street.name}_{begin:05d}.npz")
+            ),
+            takes={**takes, "stretch": (begin, end)},
+            reads={"city": city},
+            work=end - begin,
+            counts={"scans": (end - begin) * scans_per_point},
+        )
+        for begin, end in pieces
+    ]
+    end = pieces[-1][1]
+    log_task = Task(
+        log,
+        street.name,
+        DriveLog(str(path)),
+        takes={**takes, "end": end},
+        reads={"city": city, "parts": tuple(part.product for part in parts)},
+        work=end,
+    )
+    return [*parts, log_task]
+
+
+def _bytes_needed(plan: Plan) -> int:
+    """What the files that are not there yet may take, generously [bytes]."""
+    missing = [task for task in plan.tasks if task.writes.known(task.identity) is None]
+    rays, scans = (sum(task.counts.get(what, 0) for task in missing) for what in ("rays", "scans"))
+    return rays * BYTES_PER_RAY + 2 * scans * BYTES_PER_SCAN
+
+
+def require_space(folder: Path, needed: int) -> None:
+    """Refuse what would fill the disk half-way.
+
+    Raises:
+        PlanError: fewer than `needed` bytes are free where the folder is.
+    """
+    place = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
+    free = shutil.disk_usage(place).free
+    if needed > free:
+        raise PlanError(
+            f"{folder}: the simulation may need {needed / 1e9:.1f} GB and {free / 1e9:.1f} GB are "
+            "free: give another directory, fewer --paths or --size small"
+        )
+
+
+def _sized(settings: SimulationSettings, size: Size) -> SimulationSettings:
+    """The settings that a size means."""
+    if size == "full":
+        return settings
+    thin = settings.survey.model_copy(update={"rays_per_m": SMALL_RAYS})
+    return settings.model_copy(update={"survey": thin})
+
+
+def _identity(settings: SimulationSettings, scans_per_point: int, size: Size) -> dict[str, Any]:
+    """All that decides what the files of a simulation hold, whatever their drive."""
+    inputs = {
+        name: hashlib.sha256(data_file(name).read_bytes()).hexdigest()
+        for name in (settings.city.footprints, settings.city.routes)
+    }
+    return {
+        "settings": settings.model_dump(mode="json", exclude={"drive", "note"}),
+        "scans_per_point": scans_per_point,
+        "size": size,
+        "inputs_sha256": inputs,
+        "tilestream": VERSION,
+        "simulation_version": SIMULATION_VERSION,
+    }
+
+
+def _require_same(folder: Path, identity: dict[str, Any]) -> None:
+    """Refuse to mix two simulations.
+
+    Raises:
+        UsageError: the folder holds one with another identity; names what differs.
+    """
+    record = folder / RECORD
+    if not record.exists():
+        return
+    try:
+        known = yaml.safe_load(record.read_text())
+        there = {name: known.get(name) for name in identity}
+    except (yaml.YAMLError, AttributeError):
+        raise UsageError(f"{record} is no record of a simulation: give another directory") from None
+    other = [f"{name} {there[name]}" for name in identity if there[name] != identity[name]]
+    if other:
+        raise UsageError(
+            f"{folder} holds another simulation, with {'; '.join(other)} ({record}): give another "
+            "directory"
+        )
+
+
+def _begin(folder: Path, city: City, identity: dict[str, Any]) -> None:
+    """Make the folders; write what is simulated, and the routes."""
+    for part in ("survey", f"logs/drive{city.settings.drive}", "parts"):
+        (folder / part).mkdir(parents=True, exist_ok=True)
+    facts = identity | {
+        "note": city.settings.note,
+        "buildings": len(city.footprints.height),
+        "buildings_left_out": dict(city.footprints.refused),
+        "attribution": city.footprints.attribution,
+    }
+    end = SMALL_POINTS if identity["size"] == "small" else None
+    features = [_feature(street, city, end) for street in city.streets]
+    routes = {"type": "FeatureCollection", "features": features}
+    _keep(folder / ROUTES, f"{json.dumps(routes)}\n")
+    _keep(folder / RECORD, yaml.safe_dump(facts, sort_keys=True, allow_unicode=True))
+
+
+def _keep(path: Path, text: str) -> None:
+    """Write a file whole, unless it says so already: its time tells readers of a change."""
+    if not path.exists() or path.read_bytes() != text.encode():
+        with writing_whole(path) as file:
+            file.write(text.encode())
+
+
+def _feature(street: Street, city: City, end: int | None) -> dict[str, Any]:
+    """A street as GeoJSON, as far as it is simulated, with the height of its road."""
+    motion = motion_of(street, city.settings, 0.0)
+    line = motion.pose(city.ground, street.arc[:end])[:, :3, 3]
+    properties = {
+        "name": street.name,
+        "kind": street.kind,
+        "driven": street.driven,
+        "spots": [vars(spot) for spot in street.spots],
+    }
+    geometry = {"type": "LineString", "coordinates": np.round(line, 3).tolist()}
+    return {
+        "type": "Feature",
+        "id": street.name,
+        "properties": properties,
+        "geometry": geometry,
+    }

@@ -1,0 +1,1 @@
+"""A file per stage: its function, what it reads and writes, and what that takes."""

@@ -1,0 +1,146 @@
+"""The scans of a drive as a task reads them, as if by the sensor that is asked for."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from tilestream.errors import UsageError
+from tilestream.formats.deskew import Sweep, deskew
+from tilestream.formats.lesser import as_lesser
+from tilestream.formats.mcap import ScanLog, open_log
+from tilestream.marks import hash_of
+from tilestream.pipeline.engine.stage import Counts
+from tilestream.records import Scan
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How a log is read: which topics, as if by which sensor."""
+
+    path: str
+    """The log."""
+    points_topic: str | None = None
+    """Topic of the scans; None: found by type."""
+    pose_topic: str | None = None
+    """Topic of the poses; None: found by type."""
+    beams: int | None = None
+    """Beams that remain; None: all."""
+    range_max: float | None = None
+    """Largest range [m]; None: as recorded."""
+    blind_rear_deg: float | None = None
+    """Blind sector at the rear [deg]; None: none."""
+    deskew: bool = False
+    """Whether the distortion of motion is removed by the time of each point."""
+    sweep_s: float | None = None
+    """Duration of a turn [s], for logs without the time of each point; None: they have it."""
+
+    @property
+    def as_sensor(self) -> str:
+        """As if by which sensor the scans are read, in words."""
+        parts = [
+            f"{self.beams} beams" if self.beams else "",
+            f"{self.range_max:g} m" if self.range_max else "",
+            f"rear blind {self.blind_rear_deg:g} deg" if self.blind_rear_deg else "",
+            "de-skewed" if self.deskew else "",
+        ]
+        return ", ".join(part for part in parts if part) or "as recorded"
+
+    def __post_init__(self) -> None:
+        """Refuse what no scan could be read as, before any task runs.
+
+        Raises:
+            UsageError: a number outside of its range.
+        """
+        self._lesser(Scan(0, np.zeros((0, 3))))
+        if self.sweep_s is not None and not 0.0 < self.sweep_s < math.inf:
+            raise UsageError(f"sweep is {self.sweep_s!r}: give a positive time in seconds")
+
+    @property
+    def state(self) -> str:
+        """Hash of the file as it is now, and of how it is read."""
+        stat = Path(self.path).stat()
+        return hash_of(self, stat.st_size, stat.st_mtime_ns)
+
+    def open(self) -> ScanLog:
+        """The log."""
+        return open_log(self.path, points_topic=self.points_topic, pose_topic=self.pose_topic)
+
+    def seen(self, scan: Scan, log: ScanLog) -> Scan:
+        """A scan of the log as it is to be localized."""
+        if self.deskew:
+            sweep = None if self.sweep_s is None else Sweep(self.sweep_s)
+            scan = deskew(scan, log.trajectory, sweep=sweep)
+        return self._lesser(scan)
+
+    def _lesser(self, scan: Scan) -> Scan:
+        return as_lesser(
+            scan,
+            beams=self.beams,
+            range_max=self.range_max,
+            blind_rear_deg=self.blind_rear_deg,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """A sample point of a drive: one scan of the log."""
+
+    number: int
+    """Number along the drive."""
+    scan: int
+    """Index of the scan in the log."""
+    stamp_ns: int
+    """Its header stamp [ns since the epoch]."""
+    arc_length: float
+    """Length of the drive up to here [m]."""
+
+
+@dataclass(frozen=True)
+class DriveScans:
+    """Some scans of a drive, one per sample point."""
+
+    reading: Reading
+    state: str
+    """Of the log and of how it is read (`Reading.state`)."""
+    samples: tuple[Sample, ...]
+    makers: tuple[str, ...] = ()
+
+    @property
+    def identity(self) -> str:
+        """Hash of the log and of the sample points."""
+        return hash_of(self.state, self.samples)
+
+    def read(self) -> "OpenedScans":
+        """The scans, read one after the other."""
+        return OpenedScans(_opened(self.reading, self.state), self)
+
+    def counts(self) -> Counts:
+        """Nothing that memory depends on: scans are read one by one."""
+        return {}
+
+
+@dataclass(frozen=True, eq=False)
+class OpenedScans:
+    """Scans of an opened log."""
+
+    log: ScanLog
+    wanted: DriveScans
+
+    def __iter__(self) -> Iterator[tuple[Sample, Scan]]:
+        """Each sample point with its scan as recorded, which has a pose."""
+        samples = self.wanted.samples
+        scans = self.log.scans_at([sample.scan for sample in samples])
+        return zip(samples, scans, strict=True)
+
+    def seen(self, scan: Scan) -> Scan:
+        """A scan as it is to be localized."""
+        return self.wanted.reading.seen(scan, self.log)
+
+
+@lru_cache(maxsize=4)
+def _opened(reading: Reading, state: str) -> ScanLog:  # noqa: ARG001 - a changed file is another
+    return reading.open()

@@ -1,0 +1,72 @@
+"""Evaluate: let one competitor estimate what it has not seen, on every protocol."""
+
+import pandas as pd
+
+from tilestream.errors import ModelError
+from tilestream.forest.dataset import Dataset
+from tilestream.forest.evaluation import factor_sets, judge
+from tilestream.forest.protocols import PROTOCOLS
+from tilestream.pipeline.engine.outputs import Made, Stored
+from tilestream.pipeline.engine.stage import stage
+from tilestream.pipeline.stages.samples import BYTES_PER_ROW, DATASET_COLUMNS, FOREST_BYTES
+from tilestream.records import Column
+
+JUDGED_COLUMNS = (
+    *DATASET_COLUMNS,
+    Column("protocol", "place", "", "Who trains and who judges.", "definitions, 6", dtype="str"),
+    Column("row", "place", "1", "Row of the dataset that is judged.", "", dtype="int64"),
+    Column("fold", "place", "", "What was held out.", "", dtype="str"),
+    Column("arc_length", "place", "m", "Length of the route up to here.", ""),
+    Column("actual", "label", "", "What was measured, in the unit of the target.", ""),
+    Column("estimate", "label", "", "By a model that had not seen it.", "definitions, section 6"),
+    Column("median", "label", "", "Of what that model was trained on.", "definitions, section 6"),
+)
+
+
+@stage(
+    "evaluate",
+    version=4,
+    memory=lambda counts: FOREST_BYTES + BYTES_PER_ROW * counts["places"],
+    seconds=45.0,
+    columns=JUDGED_COLUMNS,
+)
+def evaluate(dataset: Dataset, competitor: str, target: str, factor_set: str, seed: int) -> Made:
+    """The held-out points of every protocol with their estimates, or why there are none.
+
+    Args:
+        dataset: every place is taken once.
+        competitor: which model or opponent.
+        target: what is estimated.
+        factor_set: name of the factors it may use (`evaluation.factor_sets`); empty: all.
+        seed: of what is random.
+    """
+    dataset = dataset.first_drives()
+    if factor_set:
+        dataset = dataset.with_columns(factor_sets(dataset.columns)[factor_set])
+    try:
+        dataset.check(target)
+    except ModelError as error:  # told beside the figures; training fails for it
+        found: dict[str, pd.DataFrame | str] = {p.name: str(error) for p in PROTOCOLS}
+    else:
+        found = judge(dataset, competitor, target, seed)
+    parts = [p.assign(protocol=name) for name, p in found.items() if not isinstance(p, str)]
+    reasons = {name: why for name, why in found.items() if isinstance(why, str)}
+    frame = pd.concat(parts, ignore_index=True) if parts else _NOTHING_JUDGED
+    return Made(frame, {"reasons": reasons, "competitor": competitor})
+
+
+_NOTHING_JUDGED = pd.DataFrame(
+    {
+        column.name: pd.Series(dtype=column.dtype)
+        for column in JUDGED_COLUMNS
+        if column.name != "distance"
+    }
+)
+
+
+def by_protocol(table: Stored) -> dict[str, pd.DataFrame | str]:
+    """What was evaluated, as `forest.evaluation.judge` gives it."""
+    found: dict[str, pd.DataFrame | str] = dict(table.facts["reasons"])
+    for name, part in table.rows.groupby("protocol", sort=False):
+        found[str(name)] = part.drop(columns="protocol").reset_index(drop=True)
+    return found

@@ -1,0 +1,81 @@
+"""Factors: what the map looks like from the sample points of a tile."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import pandas as pd
+
+from tilestream.factors.catalogue import COLUMNS, Which
+from tilestream.factors.rows import PLACE_COLUMNS, STATUS_COLUMNS, Samples, sample_rows
+from tilestream.factors.table import TermsCache
+from tilestream.factors.table import factors as factors_of
+from tilestream.marks import canonical
+from tilestream.pipeline.engine.outputs import Made, Parquet
+from tilestream.pipeline.engine.stage import Task, stage
+from tilestream.pipeline.stages.map_part import MapPart
+from tilestream.pipeline.stages.map_plan import MapPlan
+from tilestream.sensors import Sensor
+from tilestream.store import open_store
+from tilestream.tiling import Box, TileKey, whole_mm
+
+CACHE_BYTES = 300_000_000
+"""Memory for the terms of the tiles in sight, kept for the tasks that follow."""
+FIXED_BYTES = CACHE_BYTES + 300_000_000
+"""Memory of the task besides what it reads: the kept terms, the sums of some sample points."""
+BYTES_PER_POINT = 40
+"""Memory per map point in sight, of which the terms of one tile are made at a time."""
+
+
+@dataclass(frozen=True)
+class Looking:
+    """What factors are made with: the identity of a table of factors."""
+
+    sensor: Sensor
+    """What looks."""
+    cell_size: float
+    """Edge of a cell [m]."""
+    which: Which
+    """Which set of factors."""
+    sensor_height: float
+    """Height of the lidar above the ground or the route [m]."""
+
+
+@stage(
+    "factors",
+    version=2,
+    memory=lambda counts: FIXED_BYTES + BYTES_PER_POINT * counts["largest"],
+    seconds=0.002,
+    columns=(*PLACE_COLUMNS, *COLUMNS, *STATUS_COLUMNS),
+)
+def factors(map_part: MapPart, samples: Samples, looking: Looking) -> Made:
+    """The factors of sample points, a row each."""
+    store = map_part.store
+    frame = sample_rows(samples, store, looking.sensor_height)
+    positions = frame[["x", "y", "z"]].to_numpy()
+    cache = _cache(map_part.store_url, looking.cell_size, map_part.state)
+    found = factors_of(store, positions, looking.sensor, looking.cell_size, looking.which, cache)
+    return Made(pd.concat([frame, found], axis=1), {"data_set": canonical(looking)})
+
+
+@lru_cache(maxsize=1)
+def _cache(url: str, cell_size: float, state: str) -> TermsCache:  # noqa: ARG001 - part of the key
+    """The terms that this process holds for the tasks that follow."""
+    return TermsCache(open_store(url), cell_size, CACHE_BYTES)
+
+
+def factors_task(
+    plan: MapPlan, tile: TileKey, samples: Samples, looking: Looking, folder: str
+) -> Task:
+    """The factors of the sample points of a tile, from the terms of the tiles in sight."""
+    cell_mm = whole_mm(looking.cell_size, "cell_size")
+    seen = plan.over(Box.around(samples.places, looking.sensor.range_max))
+    return Task(
+        factors,
+        str(tile),
+        Parquet(f"{folder}/factors/{tile}.parquet"),
+        takes={"samples": samples, "looking": looking},
+        reads={"map_part": plan.part(seen, [plan.terms(key, cell_mm) for key in seen])},
+        work=len(samples),
+        counts={"points": plan.count(seen), "largest": plan.largest(seen)},
+        tile=tile,
+    )

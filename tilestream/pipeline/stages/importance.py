@@ -1,0 +1,52 @@
+"""Importance: how much each factor and criterion matters to the model, and to the paper's."""
+
+import pandas as pd
+
+from tilestream.errors import ModelError
+from tilestream.forest.dataset import Dataset
+from tilestream.forest.evaluation import criterion_importances, importances, importances_of
+from tilestream.forest.training import MAIN, Model
+from tilestream.pipeline.engine.outputs import Made
+from tilestream.pipeline.engine.stage import stage
+from tilestream.pipeline.stages.samples import BYTES_PER_ROW, FOREST_BYTES
+from tilestream.records import Column
+
+WEIGHT_COLUMNS = (
+    Column("model", "place", "", "`used`: the model's own forest; `paper`.", "", dtype="str"),
+    Column("factor", "place", "", "The factor; empty: its whole criterion.", "", dtype="str"),
+    Column("criterion", "place", "", "Its criterion.", "Table IV", dtype="str"),
+    Column("importance", "label", "1", "The forest's own: they sum to 1.", "impurity decrease"),
+    Column("factors", "label", "1", "Factors of the criterion.", ""),
+    Column("increase", "label", "m", "Of the error when the criterion is permuted.", "held out"),
+    Column("spread", "label", "m", "Standard deviation of that over repeats.", ""),
+)
+
+
+@stage(
+    "importance",
+    version=4,
+    memory=lambda counts: FOREST_BYTES + BYTES_PER_ROW * counts["places"],
+    seconds=100.0,
+    columns=WEIGHT_COLUMNS,
+)
+def importance(dataset: Dataset, model: Model, seed: int) -> Made:
+    """A row per factor and model with its importance, and one per criterion permuted."""
+    dataset = dataset.first_drives()
+    dataset.check()
+    used = dataset.with_columns([c for c in dataset.columns if c.name in model.factors])
+    papers = dataset.with_columns([c for c in dataset.columns if c.factor_set == "faithful"])
+    tables = [
+        importances_of(model.forests[MAIN], used.columns).assign(model="used"),
+        importances(papers, seed=seed).assign(model="paper"),
+    ]
+    reason = ""
+    try:
+        permuted = [
+            criterion_importances(used, recipe=model.recipe, seed=seed).assign(model="used"),
+            criterion_importances(dataset, seed=seed).assign(model="paper"),
+        ]
+    except ModelError as error:
+        reason = str(error)
+    else:
+        tables += [table.assign(factor="") for table in permuted]
+    return Made(pd.concat(tables, ignore_index=True), {"reason": reason})

@@ -1,0 +1,101 @@
+"""Label: sum up the starts of a slice of scans, a row per sample point."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import pandas as pd
+
+from tilestream.localization import summary
+from tilestream.pipeline.engine.outputs import Made, Stored
+from tilestream.pipeline.engine.stage import stage
+from tilestream.pipeline.stages.drive_scans import Sample
+from tilestream.pipeline.stages.register import SCAN_COLUMNS
+from tilestream.records import Column
+
+ERROR_COLUMNS = (
+    *SCAN_COLUMNS,
+    Column("x", "place", "m", "True position of the lidar in the map.", "see true_pose"),
+    Column("y", "place", "m", "True position of the lidar in the map.", "see true_pose"),
+    Column("z", "place", "m", "True position of the lidar in the map.", "see true_pose"),
+    Column("heading", "place", "rad", "True heading, from the map's x axis.", "see true_pose"),
+    Column("arc_length", "place", "m", "Length of the drive up to here.", "of the log's poses"),
+    Column("true_pose", "label", "", "log or refined.", "definitions, section 5", dtype="str"),
+    Column("as_sensor", "label", "", "As if by which sensor the log was read.", "", dtype="str"),
+    Column("points", "label", "1", "Scan points that were registered, thinned.", "", dtype="int64"),
+    Column("starts", "label", "1", "Number of starts.", "", dtype="int64"),
+    Column("converged", "label", "1", "Share of starts that converged.", ""),
+    Column("iterations", "label", "1", "Mean number of Newton steps.", ""),
+    Column("nvtl", "label", "1", "Mean NVTL at the end.", "Autoware"),
+    Column("error_mean", "label", "m", "Mean 3D error of all starts.", "the paper's label"),
+    Column(
+        "p_fail", "label", "1", "Share of starts with a 3D error above 0.5 m.", "definitions, 5"
+    ),
+    Column("mean_held", "label", "m", "Mean 3D error of the starts that did not fail.", ""),
+    Column("median_held", "label", "m", "Median of the same.", ""),
+    Column("p95_held", "label", "m", "95th percentile of the same.", ""),
+    Column("along_mean", "label", "m", "Mean of abs(along).", ""),
+    Column("across_mean", "label", "m", "Mean of abs(across).", ""),
+    Column("up_mean", "label", "m", "Mean of abs(up).", ""),
+    Column("yaw_mean", "label", "rad", "Mean of abs(yaw).", ""),
+    Column(
+        "error_floor", "label", "m", "Mean 3D error of the starts within 1 m.", "definitions, 5"
+    ),
+    Column("error_tail", "label", "m", "error_mean - error_floor.", "definitions, section 5"),
+    Column("status", "place", "", "done, or failed.", "", dtype="str"),
+    Column("reason", "place", "", "Why it failed.", "", dtype="str"),
+)
+
+
+@stage("label", version=2, memory=lambda _: 100_000_000, seconds=0.006, columns=ERROR_COLUMNS)
+def label(starts: Sequence[Stored], samples: Sequence[Sample]) -> Made:
+    """A row per sample point, in their order.
+
+    Args:
+        starts: the starts of each batch, with what is true of all starts of a scan.
+        samples: the sample points.
+    """
+    frame = pd.concat([part.rows for part in starts], ignore_index=True)
+    facts: dict[str, dict[str, Any]] = {}
+    for part in starts:
+        for number, fact in part.facts["samples"].items():  # the first batch that failed decides
+            facts[number] = fact | {"reason": facts.get(number, fact)["reason"] or fact["reason"]}
+    data_set = starts[0].facts["data_set"]
+    rows = [_row(sample, facts[str(sample.number)], data_set, frame) for sample in samples]
+    names = {column.name: column.dtype for column in ERROR_COLUMNS}
+    labels = pd.DataFrame(rows).reindex(columns=list(names)).astype(names)
+    return Made(labels, {"data_set": data_set})
+
+
+def _row(
+    sample: Sample, fact: dict[str, Any], data_set: dict[str, Any], starts: pd.DataFrame
+) -> dict[str, Any]:
+    """The row of a sample point."""
+    row: dict[str, Any] = {
+        "points": 0,
+        "starts": 0,
+        "sample": sample.number,
+        "scan": sample.scan,
+        "stamp_ns": sample.stamp_ns,
+        "arc_length": sample.arc_length,
+        "status": "failed" if fact["reason"] else "done",
+        "true_pose": data_set["true_pose"],
+        "as_sensor": data_set["as_sensor"],
+        **fact,
+    }
+    if not fact["reason"]:
+        row |= _summed(starts[starts["sample"] == sample.number])
+    return row
+
+
+def _summed(starts: pd.DataFrame) -> dict[str, float]:
+    """The label of one sample point from the rows of its starts."""
+    starts = starts.sort_values("start")
+    names = ("along", "across", "up", "yaw", "error")
+    errors = {name: starts[name].to_numpy() for name in names}
+    return {
+        "starts": len(starts),
+        "converged": float(starts["converged"].mean()),
+        "iterations": float(starts["iterations"].mean()),
+        "nvtl": float(starts["nvtl"].mean()),
+        **summary(errors, starts["distance"].to_numpy()),
+    }

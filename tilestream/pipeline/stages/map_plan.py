@@ -1,0 +1,127 @@
+"""The map as a plan sees it: the tables of its tiles, those that are there and those to be made."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+from tilestream.factors.surfels import surfel_mm, surfels_table
+from tilestream.factors.terms import terms_table
+from tilestream.marks import hash_of
+from tilestream.pipeline.engine.outputs import TileArrays
+from tilestream.pipeline.engine.stage import Stage, Task
+from tilestream.pipeline.stages.cells import cells
+from tilestream.pipeline.stages.map_part import MapPart
+from tilestream.pipeline.stages.surfels import surfels
+from tilestream.pipeline.stages.terms import terms
+from tilestream.store import POINTS, TileStore, TileTable, cells_table
+from tilestream.tiling import Box, TileKey
+
+EXPECTED_DENSITY = 100
+"""Points per square metre that a thinned tile is expected to keep, before it is merged: more than
+any road at 0.2 m [1/m^2]. What a task really reads is checked when it runs."""
+
+
+class TilePoints(NamedTuple):
+    """The points of a tile, as they are or will be."""
+
+    identity: str
+    maker: str
+    """Key of the task that merges them; empty: they are there."""
+    count: int
+    """How many, or how many are expected."""
+
+
+class MapPlan:
+    """What a map's tiles have or will have, and the tasks that make it, each of them once."""
+
+    def __init__(self, store: TileStore, points: Mapping[TileKey, TilePoints]) -> None:
+        """A map.
+
+        Args:
+            store: where it is.
+            points: the points of all its tiles.
+        """
+        self.store = store
+        self.points = points
+        self.tasks: dict[str, Task] = {}
+        """By key, each after those that it needs."""
+        self._state = hash_of([(str(key), tile.identity) for key, tile in sorted(points.items())])
+
+    @classmethod
+    def of_store(cls, store: TileStore) -> "MapPlan":
+        """A map that is there."""
+        marks = store.marks(POINTS)
+        done = {key: mark for key, mark in marks.items() if mark.status == "done"}
+        return cls(
+            store, {k: TilePoints(m.identity, "", m.facts["points"]) for k, m in done.items()}
+        )
+
+    @classmethod
+    def of_merges(cls, store: TileStore, merges: Iterable[Task]) -> "MapPlan":
+        """A map whose tiles are merged by these tasks."""
+        area = (store.settings.tile_size) ** 2
+        most = EXPECTED_DENSITY * area if store.settings.map_leaf else float("inf")
+        points = {
+            task.tile: TilePoints(task.identity, task.key, int(min(task.counts["points"], most)))
+            for task in merges
+            if task.tile is not None
+        }
+        return cls(store, points)
+
+    def over(self, box: Box) -> list[TileKey]:
+        """The tiles of the map that a box touches, sorted."""
+        return [key for key in self.store.grid.keys_over(box) if key in self.points]
+
+    def cells(self, key: TileKey, cell_mm: int) -> Task:
+        """The task that makes the cells of a tile."""
+        return self._made(cells, cells_table(cell_mm), f"{cell_mm}-{key}", key, [])
+
+    def terms(self, key: TileKey, cell_mm: int) -> Task:
+        """The task that makes the terms of a tile's cells."""
+        table = terms_table(cell_mm)
+        near = [self.cells(k, cell_mm) for k in table.tiles(self.store.grid, key, self.points)]
+        return self._made(terms, table, f"{cell_mm}-{key}", key, near)
+
+    def surfels(self, key: TileKey) -> Task:
+        """The task that makes the surfels of a tile."""
+        return self._made(surfels, surfels_table(surfel_mm(self.store)), str(key), key, [])
+
+    def part(self, keys: Sequence[TileKey], made: Sequence[Task]) -> MapPart:
+        """Some tiles as a task reads them.
+
+        Args:
+            keys: the tiles.
+            made: the tasks that make what is read of them; none: their points are read.
+        """
+        points = [self.points[key] for key in keys]
+        inputs = [(str(task.tile), task.identity) for task in made]
+        inputs = inputs or [(str(k), p.identity) for k, p in zip(keys, points, strict=True)]
+        makers = [task.key for task in made] or [p.maker for p in points if p.maker]
+        return MapPart(self.store.url, tuple(keys), hash_of(inputs), tuple(makers), self._state)
+
+    def count(self, keys: Iterable[TileKey]) -> int:
+        """The points of some tiles, as they are or are expected."""
+        return sum(self.points[key].count for key in keys)
+
+    def largest(self, keys: Iterable[TileKey]) -> int:
+        """The points of the largest of some tiles."""
+        return max((self.points[key].count for key in keys), default=0)
+
+    def _made(
+        self, stage: Stage, table: TileTable, name: str, key: TileKey, near: Sequence[Task]
+    ) -> Task:
+        known = self.tasks.get(f"{stage.name}-{name}")
+        if known is not None:
+            return known
+        keys = table.tiles(self.store.grid, key, self.points)
+        task = Task(
+            stage,
+            name,
+            TileArrays(self.store.url, key, table.name),
+            takes={**table.takes, "tile": key},
+            reads={"map_part": replace(self.part(keys, near), core=key)},
+            counts={"points": self.count(keys), "core": self.points[key].count},
+            tile=key,
+        )
+        self.tasks[task.key] = task
+        return task

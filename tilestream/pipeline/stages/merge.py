@@ -1,0 +1,219 @@
+"""Merge: gather the points of a tile from all fragments, thin them, write the tile."""
+
+import itertools
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from tilestream.errors import CorruptSourceError
+from tilestream.kernels import thinning
+from tilestream.marks import hash_of
+from tilestream.pipeline.engine.outputs import Made, TileArrays
+from tilestream.pipeline.engine.plan import Plan
+from tilestream.pipeline.engine.stage import BASE_BYTES, Counts, Task, stage
+from tilestream.pipeline.stages.scatter import Fragment, Int32, Print, add_prints, fragment_path
+from tilestream.records import Int64
+from tilestream.store import POINTS, TileStore, open_store
+from tilestream.tiling import MM_PER_M, TileGrid, TileKey, whole_mm
+
+BATCH_POINTS = 500_000
+"""Points that are read at a time."""
+BYTES_PER_BATCH_POINT = 40
+"""Memory per point of a batch: read, and those of a strip picked."""
+BYTES_PER_STRIP_POINT = 40
+"""Memory per point of a strip: read, ordered, keys of an axis."""
+BYTES_PER_STORED_POINT = 32
+"""Memory per point of the tile: the strips that are done, the tile, packed."""
+MAX_STRIPS = 64
+"""Strips that a tile is at most cut into to merge it within the promised memory."""
+MAX_BINS = 2**22
+"""Widest range of voxels along an axis that is counted as it is."""
+SORT_EDGE_MM = 1000
+"""Unthinned points are stored sorted by voxels of this edge, then by x, y, z."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Points of one tile that lie together in one fragment file."""
+
+    fragment: str
+    """Name of the fragment."""
+    start: int
+    """First point in the file."""
+    count: int
+    """Number of points."""
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """The points of one tile in all fragments: the same set of points, the same identity."""
+
+    store_url: str
+    pieces: tuple[Piece, ...]
+    fingerprint: Print
+    strips: int
+    """Into how many strips along x the tile is cut, one in memory at a time; changes no result."""
+    makers: tuple[str, ...] = ()
+
+    @property
+    def count(self) -> int:
+        """Number of points."""
+        return sum(piece.count for piece in self.pieces)
+
+    @property
+    def identity(self) -> str:
+        """Hash of the set of points."""
+        return hash_of(self.count, *self.fingerprint)
+
+    def read(self) -> "Pieces":
+        """Itself: `batches` reads, strip by strip."""
+        return self
+
+    def counts(self) -> Counts:
+        """What the plan knows too."""
+        return {}
+
+    def batches(self) -> Iterator[Int32]:
+        """The points, (n, 3) int32 [mm from the tile's origin], n <= `BATCH_POINTS`.
+
+        Raises:
+            CorruptSourceError: a fragment is shorter than its index says (removed or cut
+                meanwhile).
+        """
+        store, point = open_store(self.store_url), 3 * np.dtype(np.int32).itemsize
+        for piece in self.pieces:
+            path = f"{fragment_path(store, piece.fragment)}.bin"
+            end = piece.start + piece.count
+            for start in range(piece.start, end, BATCH_POINTS):
+                stop = min(start + BATCH_POINTS, end)
+                data = store.fs.cat_file(path, start=start * point, end=stop * point)
+                if len(data) != (stop - start) * point:
+                    raise CorruptSourceError(f"{path} was cut short: run the same command again")
+                yield np.frombuffer(data, np.int32).reshape(-1, 3)
+
+
+def memory_of(points: int, strips: int) -> int:
+    """Memory of merging a tile of so many points in so many strips [bytes]."""
+    batch = min(points, BATCH_POINTS) * BYTES_PER_BATCH_POINT
+    return batch + points * BYTES_PER_STORED_POINT + points * BYTES_PER_STRIP_POINT // strips
+
+
+def strips_fitting(points: int, memory: int) -> int:
+    """The fewest strips that fit so much memory; strips differ, so twice as many as on average."""
+    of_strips = points * BYTES_PER_STRIP_POINT
+    free = max(1, memory - memory_of(points, 1) + of_strips)
+    needed = -(-of_strips // free)
+    return 1 if needed <= 1 else min(MAX_STRIPS, 2 * needed)
+
+
+@stage(
+    "merge",
+    version=3,
+    memory=lambda counts: memory_of(counts["points"], counts["strips"]),
+    seconds=0.1,
+)
+def merge(pieces: Pieces, grid: TileGrid, tile: TileKey, map_leaf: float) -> Made:
+    """The points of one tile, thinned: one column `xyz`, (3, n) int32 [mm from its origin].
+
+    Args:
+        pieces: its points, in any order.
+        grid: the tiles.
+        tile: which.
+        map_leaf: edge of the voxels that the map is thinned to [m]; 0: all points are kept.
+
+    Returns:
+        The column, with the count and extents of the points.
+    """
+    origin, leaf = np.array(grid.origin_mm(tile), np.int64), whole_mm(map_leaf, "map_leaf")
+    edge = leaf or SORT_EDGE_MM
+    columns = -(-grid.tile_mm // edge)
+    borders = [edge * (columns * i // pieces.strips) for i in range(pieces.strips + 1)]
+    parts = []
+    for lo, hi in itertools.pairwise(borders):
+        batches = [
+            b[(b[:, 0] >= lo) & (b[:, 0] < hi)] if pieces.strips > 1 else b
+            for b in pieces.batches()
+        ]
+        points = np.concatenate(batches)
+        del batches
+        parts.append(thin(points, leaf, origin) if leaf else sort(points))
+    xyz = np.concatenate(parts, axis=1) if len(parts) > 1 else parts[0]
+    facts = {
+        "points": xyz.shape[1],
+        "read": pieces.count,
+        "lowest": ((xyz.min(axis=1) + origin) / MM_PER_M).tolist(),
+        "highest": ((xyz.max(axis=1) + origin) / MM_PER_M).tolist(),
+    }
+    return Made({"xyz": xyz}, facts)
+
+
+def merge_tasks(store: TileStore, fragments: Iterable[Fragment], memory: int) -> Plan:
+    """The writing half of an ingest: one task per tile that holds a point.
+
+    Args:
+        store: where the tiles go.
+        fragments: the indices of all fragments of sources that were read whole.
+        memory: what a task may use [bytes].
+
+    Raises:
+        PlanError: a tile does not fit the memory, not even strip by strip.
+    """
+    pieces: dict[TileKey, list[Piece]] = {}
+    prints: dict[TileKey, Print] = {}
+    for fragment in fragments:
+        for ix, iy, start, count in fragment.pieces:
+            pieces.setdefault(TileKey(ix, iy), []).append(Piece(fragment.name, start, count))
+        for ix, iy, a, b in fragment.prints:
+            key = TileKey(ix, iy)
+            prints[key] = add_prints(prints.get(key, (0, 0)), (a, b))
+    tasks = []
+    for key in sorted(pieces):
+        points = sum(piece.count for piece in pieces[key])
+        strips = strips_fitting(points, memory - BASE_BYTES)
+        tasks.append(
+            Task(
+                merge,
+                str(key),
+                TileArrays(store.url, key, POINTS),
+                takes={"grid": store.grid, "tile": key, "map_leaf": store.settings.map_leaf},
+                reads={"pieces": Pieces(store.url, tuple(pieces[key]), prints[key], strips)},
+                counts={"points": points, "strips": strips},
+                tile=key,
+            )
+        )
+    return Plan.of(tasks, memory)
+
+
+def thin(points: Int32, leaf: int, origin: Int64) -> Int32:
+    """One point per voxel: (3, m) int32 centroids [mm from the tile's origin], in voxel order."""
+    ordered = by_voxel(points, leaf)
+    out = np.empty_like(ordered)
+    voxels = thinning.centroids(ordered, leaf, origin, out)
+    return np.ascontiguousarray(out[:voxels].T)
+
+
+def sort(points: Int32) -> Int32:
+    """All points, (3, n) int32, by voxels of SORT_EDGE_MM, then x, y, z."""
+    ordered = by_voxel(points, SORT_EDGE_MM)
+    thinning.sort_in_voxels(ordered, SORT_EDGE_MM)
+    return np.ascontiguousarray(ordered.T)
+
+
+def by_voxel(points: Int32, edge: int) -> Int32:
+    """The (n, 3) points ordered by voxel, lexicographically: a counting sort per axis, z first."""
+    for axis in (2, 1, 0):
+        keys = dense(points[:, axis] // np.int32(edge))
+        counts = np.bincount(keys)
+        ordered = np.empty_like(points)
+        thinning.place_rows(points, keys, np.cumsum(counts) - counts, ordered)
+        points = ordered
+    return points
+
+
+def dense(keys: Int32) -> Int64:
+    """The keys from 0, in their order; without gaps where stray points make these too wide."""
+    lowest = int(keys.min(initial=0))
+    if int(keys.max(initial=0)) - lowest > MAX_BINS:
+        return np.unique(keys, return_inverse=True)[1].astype(np.int64)
+    return keys.astype(np.int64) - lowest

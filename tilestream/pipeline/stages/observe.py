@@ -1,0 +1,101 @@
+"""Observe: the virtual drive from the sample points of a tile."""
+
+from dataclasses import dataclass
+
+import pandas as pd
+
+from tilestream.config import RegistrationSettings
+from tilestream.factors.observability import COLUMNS, MARGIN, observability
+from tilestream.factors.rows import PLACE_COLUMNS, STATUS_COLUMNS, Samples, sample_rows
+from tilestream.factors.virtual_scan import VirtualSettings
+from tilestream.marks import canonical
+from tilestream.pipeline.engine.outputs import Made, Parquet
+from tilestream.pipeline.engine.stage import Task, stage
+from tilestream.pipeline.stages.map_part import MapPart
+from tilestream.pipeline.stages.map_plan import MapPlan
+from tilestream.sensors import Sensor
+from tilestream.tiling import Box, TileKey, whole_mm
+
+FIXED_BYTES = 600_000_000
+"""Memory of the task besides what it reads: a scene, the registrations, and the terms that factors
+tasks keep in the same process."""
+BYTES_PER_POINT = 60
+"""Memory per map point in sight: its surfels and cells, those in view of a place once more."""
+
+
+@dataclass(frozen=True)
+class Observing:
+    """What is observed with: the identity of a table of observability."""
+
+    sensor: Sensor
+    """What looks."""
+    seeing: VirtualSettings
+    """How it sees, and where the virtual drive starts."""
+    registration: RegistrationSettings
+    """The matcher of the vehicle."""
+    cell_size: float
+    """Edge of a cell [m]."""
+    sensor_height: float
+    """Height of the lidar above the ground or the route [m]."""
+
+    @property
+    def range_max(self) -> float:
+        """How far it sees [m]."""
+        usable = self.seeing.range_max
+        return self.sensor.range_max if usable is None else min(usable, self.sensor.range_max)
+
+
+@stage(
+    "observe",
+    version=3,
+    memory=lambda counts: FIXED_BYTES + BYTES_PER_POINT * counts["points"],
+    seconds=0.18,
+    columns=(*PLACE_COLUMNS, *COLUMNS, *STATUS_COLUMNS),
+)
+def observe(map_part: MapPart, samples: Samples, observing: Observing) -> Made:
+    """The observability of sample points, a row each."""
+    store = map_part.store
+    frame = sample_rows(samples, store, observing.sensor_height)
+    found = observability(
+        store,
+        frame[["x", "y", "z"]].to_numpy(),
+        frame["heading"].to_numpy(),
+        observing.sensor,
+        observing.seeing,
+        observing.registration,
+        observing.cell_size,
+    )
+    return Made(pd.concat([frame, found], axis=1), {"data_set": canonical(observing)})
+
+
+def observe_task(
+    plan: MapPlan,
+    tile: TileKey,
+    samples: Samples,
+    observing: Observing,
+    folder: str,
+    group: str = "",
+) -> Task:
+    """The observability of the sample points of a tile, from surfels and cells of those in sight.
+
+    Args:
+        plan: the map.
+        tile: the tile that holds the sample points.
+        samples: the sample points.
+        observing: what is observed with.
+        folder: of the tables.
+        group: as whose sensor, where one plan observes with several.
+    """
+    cell_mm = whole_mm(observing.cell_size, "cell_size")
+    seen = plan.over(Box.around(samples.places, observing.range_max + MARGIN))
+    made = [task for k in seen for task in (plan.cells(k, cell_mm), plan.surfels(k))]
+    return Task(
+        observe,
+        "-".join(part for part in (group, str(tile)) if part),
+        Parquet(f"{folder}/observability/{tile}.parquet"),
+        takes={"samples": samples, "observing": observing},
+        reads={"map_part": plan.part(seen, made)},
+        work=len(samples),
+        counts={"points": plan.count(seen)},
+        tile=tile,
+    )

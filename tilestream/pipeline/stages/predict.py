@@ -1,0 +1,79 @@
+"""Predict: the estimated error of the sample points of a tile."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from tilestream.factors.rows import PLACE_COLUMNS
+from tilestream.factors.virtual_drive import physics
+from tilestream.forest.reasons import without_training
+from tilestream.forest.training import PREDICTION_COLUMNS, Model
+from tilestream.forest.training import predict as predicted
+from tilestream.pipeline.engine.outputs import Stored
+from tilestream.pipeline.engine.stage import stage
+from tilestream.pipeline.stages.samples import BYTES_PER_ROW, places_with_factors
+
+LARGE_ERROR = 0.10
+"""Without training: an estimate above this has a reason [m] (the least error of the paper's
+Table I)."""
+MODEL_BYTES = 300_000_000
+"""Memory of the task besides its rows: the model and what reads it."""
+
+
+@stage(
+    "predict",
+    version=4,
+    memory=lambda counts: MODEL_BYTES + BYTES_PER_ROW * counts["places"],
+    seconds=0.004,
+    columns=(*PLACE_COLUMNS, *PREDICTION_COLUMNS),
+)
+def predict(
+    factors: Stored,
+    observed: Sequence[Stored],
+    making: dict[str, Any],
+    offset: float,
+    model: Model | None = None,
+) -> pd.DataFrame:
+    """The estimates of sample points, a row each.
+
+    Args:
+        factors: the table of factors of their tile.
+        observed: the tables of observability of this tile and of those around it; none: the job
+            has no virtual drive.
+        making: what the factors were made with.
+        offset: without a model: what a real scan adds to the error of a virtual one [m].
+        model: None: the virtual drive as it is.
+    """
+    places = places_with_factors([factors], observed)
+    found = physical(places, offset) if model is None else predicted(model, places, making)
+    return pd.concat([places[[column.name for column in PLACE_COLUMNS]], found], axis=1)
+
+
+def physical(places: pd.DataFrame, offset: float) -> pd.DataFrame:
+    """What the virtual drive says of places, in the columns of a model's estimates.
+
+    There is no interval, and no training place to be like: `low`, `high`, `domain_distance` and
+    `in_domain` are empty. Estimates above `LARGE_ERROR` have a reason.
+    """
+    good = places["status"] == "done"
+    error = physics(places["vd_mean"].to_numpy(), offset)
+    values: dict[str, Any] = {
+        "estimate": error,
+        "p_fail": places["vd_p_fail"],
+        "floor": physics(places["vd_floor"].to_numpy(), offset),
+        "tail": places["vd_tail"],
+        "along": places["vd_along"],
+        "across": places["vd_across"],
+        "up": places["vd_up"],
+    }
+    blank = {c.name: np.nan for c in PREDICTION_COLUMNS if c.dtype == "float64"}
+    frame = pd.DataFrame({**blank, **values}, index=places.index)
+    frame.loc[~good, list(values)] = np.nan
+    reason = places["reason"].astype(object)
+    large = good & (error > LARGE_ERROR)
+    reason[large] = without_training(places[large])
+    unknown = pd.array([None] * len(places), dtype="boolean")
+    words: dict[str, Any] = {"in_domain": unknown, "status": places["status"], "reason": reason}
+    return frame.assign(**words)[[column.name for column in PREDICTION_COLUMNS]]

@@ -1,0 +1,156 @@
+"""Samples: the factors, virtual drives and labels of the same places, joined once."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from tilestream.errors import SourceNotFoundError
+from tilestream.factors import catalogue, observability
+from tilestream.factors.rows import PLACE_COLUMNS
+from tilestream.factors.virtual_drive import averaged_along
+from tilestream.forest.dataset import Dataset, features_of, join
+from tilestream.marks import Mark
+from tilestream.pipeline.engine.outputs import Facts, Made, Stored
+from tilestream.pipeline.engine.stage import stage
+from tilestream.pipeline.stages.label import ERROR_COLUMNS
+from tilestream.records import Column
+from tilestream.tables import read_mark, read_tables, write_table
+
+FOREST_BYTES = 500_000_000
+"""Memory of a task that grows forests on some thousand places, beyond the interpreter."""
+BYTES_PER_ROW = 10_000
+"""Memory per sample point of a joined table: a thousand numbers in several copies."""
+
+MAY_BE_NAN = ("ob_cov_along", "ob_cov_across", "ob_cov_up", "ob_cov_yaw", "vd_median")
+"""What observability has no number for at a place that is lost: the others tell how lost it is."""
+COLUMNS = (
+    *catalogue.COLUMNS,
+    *(column for column in observability.COLUMNS if column.name not in MAY_BE_NAN),
+)
+"""All factors that a model may learn from."""
+DATASET_COLUMNS = (
+    Column("group", "place", "", "Which drive, as whose sensor.", "", dtype="str"),
+    Column("path", "place", "", "The route that the place lies on.", "", dtype="str"),
+    Column("block", "place", "", "Piece of the path that is held out as one.", "", dtype="str"),
+    Column("distance", "place", "m", "Between the scan and the sample point.", ""),
+)
+LOST_COLUMNS = (
+    *DATASET_COLUMNS,
+    Column("sample", "place", "1", "Number of the sample point of the drive.", "", dtype="int64"),
+    Column("reason", "place", "", "Why the label is not in the dataset.", "", dtype="str"),
+    Column("detail", "place", "", "More of it.", "", dtype="str"),
+)
+
+
+@dataclass(frozen=True)
+class DatasetFile:
+    """Where the dataset goes; what is lost goes to `lost.parquet` beside it, first."""
+
+    path: str
+
+    def known(self, identity: str) -> Facts | None:
+        """As of any table."""
+        mark = read_mark(self.path)
+        return {"rows": mark.facts["rows"]} if mark.is_of(identity) else None
+
+    def write(self, made: Made, identity: str, columns: Sequence[Column]) -> Facts:  # noqa: ARG002
+        """Write the rows, documented, and what was lost."""
+        dataset: Dataset = made.value
+        frame = dataset.lost.astype({"sample": np.int64})
+        frame = frame.assign(detail=frame["detail"].astype(str))
+        write_table(self._lost, frame, LOST_COLUMNS, Mark("done", identity=identity))
+        kept = (*DATASET_COLUMNS, *PLACE_COLUMNS, *ERROR_COLUMNS, *features_of(COLUMNS))
+        names = {column.name for column in kept}
+        rows = dataset.rows[[name for name in dataset.rows if name in names]]
+        facts = {
+            "rows": len(rows),
+            "features": dataset.names,
+            "made_with": dict(dataset.made_with),
+            "data_sets": {name: dict(facts) for name, facts in dataset.data_sets.items()},
+        }
+        write_table(self.path, rows, kept, Mark("done", identity=identity, facts=facts))
+        return {"rows": len(rows)}
+
+    def read(self) -> Dataset:
+        """The dataset; a process keeps the last one.
+
+        Raises:
+            SourceNotFoundError: there is none.
+        """
+        mark = read_mark(self.path)
+        if mark.status != "done":
+            raise SourceNotFoundError(f"{self.path}: no dataset; the job that joins it has not run")
+        return _dataset(self, mark.identity)
+
+    @property
+    def _lost(self) -> str:
+        return f"{self.path.rsplit('/', 1)[0]}/lost.parquet"
+
+
+@lru_cache(maxsize=1)
+def _dataset(file: DatasetFile, identity: str) -> Dataset:  # noqa: ARG001 - another is read again
+    facts = read_mark(file.path).facts
+    known = {column.name: column for column in features_of(COLUMNS)}
+    columns = tuple(known[name] for name in facts["features"])
+    lost = read_tables([file._lost])
+    return Dataset(read_tables([file.path]), columns, lost, facts["made_with"], facts["data_sets"])
+
+
+@stage(
+    "samples",
+    version=4,
+    memory=lambda counts: FOREST_BYTES + BYTES_PER_ROW * counts["places"],
+    seconds=0.001,
+)
+def samples(
+    factors: Sequence[Stored],
+    observed: Sequence[Stored],
+    labels: Sequence[Stored],
+    groups: Sequence[str],
+    making: dict[str, Any],
+) -> Dataset:
+    """The factors and the errors of the same places as one dataset.
+
+    Args:
+        factors: tables of factors.
+        observed: tables of observability; none: the job has no virtual drive.
+        labels: tables of errors.
+        groups: of each table of errors, which drive it is of, as whose sensor.
+        making: what the factors were computed with.
+    """
+    of_group: dict[str, list[Stored]] = {}
+    for group, table in zip(groups, labels, strict=True):
+        of_group.setdefault(group, []).append(table)
+    rows = {name: _rows(tables) for name, tables in of_group.items()}
+    data_sets = {name: tables[0].facts["data_set"] for name, tables in of_group.items()}
+    places = places_with_factors(factors, observed)
+    return join(places, rows, COLUMNS, made_with=making, data_sets=data_sets)
+
+
+def places_with_factors(factors: Sequence[Stored], observed: Sequence[Stored]) -> pd.DataFrame:
+    """Every sample point of the factor tables with all its factors.
+
+    A place that has the factors and could not be observed has NaN there, and says why. Virtual
+    drives are averaged along the route (`averaged_along`), so the tables of observability of the
+    tiles around have to be given too.
+    """
+    places = _rows(factors)
+    if not observed:
+        return places
+    keys = ["route_id", "sample"]
+    names = [column.name for column in observability.COLUMNS]
+    seen = averaged_along(_rows(observed))[[*keys, *names, "status", "reason"]]
+    seen = seen.rename(columns={"status": "seen", "reason": "why"})
+    joined = places.merge(seen, on=keys, how="left", validate="one_to_one")
+    blind = (joined["status"] == "done") & (joined["seen"] != "done")
+    joined.loc[blind, "status"] = joined.loc[blind, "seen"].fillna("failed")
+    joined.loc[blind, "reason"] = joined.loc[blind, "why"].fillna("its task failed")
+    return joined.drop(columns=["seen", "why"])
+
+
+def _rows(tables: Sequence[Stored]) -> pd.DataFrame:
+    return pd.concat([table.rows for table in tables], ignore_index=True)
