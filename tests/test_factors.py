@@ -16,7 +16,8 @@ from tilestream.factors.feature_sufficiency import dimensions, shape_shares
 from tilestream.factors.table import TermsCache, factors
 from tilestream.factors.terms import reach_mm, terms_mark, terms_table, tile_terms
 from tilestream.formats.pcd import write_pcd
-from tilestream.store import POINTS, Mark, Tile, TileStore
+from tilestream.marks import Mark
+from tilestream.store import POINTS, Tile, TileStore
 
 Floats = NDArray[np.float64]
 EYE = np.array([[10.0, 0.0, 2.0]])

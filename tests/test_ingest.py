@@ -31,6 +31,7 @@ from tilestream.formats.las import write_las
 from tilestream.formats.pcd import write_pcd
 from tilestream.pipeline.engine import plan
 from tilestream.pipeline.jobs import ingest as ingest_map
+from tilestream.pipeline.stages import merge, scatter
 from tilestream.store import POINTS
 
 

@@ -26,13 +26,14 @@ from tilestream.formats.lesser import as_lesser
 from tilestream.formats.mcap import open_log
 from tilestream.formats.pcd import write_pcd
 from tilestream.localization import refined_pose, start_poses
+from tilestream.marks import Mark
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.jobs.localize import REACH, choose_samples
 from tilestream.pipeline.stages.drive_scans import Reading
 from tilestream.pipeline.stages.label import ERROR_COLUMNS
 from tilestream.pipeline.stages.register import START_COLUMNS
 from tilestream.records import Cells
-from tilestream.store import POINTS, Mark, Tile
+from tilestream.store import POINTS, Tile
 from tilestream.tables import read_mark, read_tables
 
 LENGTH = 80.0
@@ -241,7 +242,7 @@ def test_every_column_is_documented_in_the_files(plain: tuple[pd.DataFrame, Path
                 text = field.metadata[b"unit"] == b""
                 assert text == (field.name in {"true_pose", "as_sensor", "status", "reason"})
             mark = read_mark(str(path))
-                assert mark.facts["data_set"]["registration"]["neighbours"] == "direct7"
+            assert mark.facts["data_set"]["registration"]["neighbours"] == "direct7"
             assert mark.facts["data_set"]["starts"]["radius"] == 0.4
             assert mark.facts["data_set"]["true_pose"] == "log"
 

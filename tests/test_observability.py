@@ -32,7 +32,8 @@ from tilestream.factors.virtual_drive import (
 from tilestream.factors.virtual_scan import Beams, Scene, VirtualSettings, cast
 from tilestream.formats.pcd import write_pcd
 from tilestream.localization import localization_error, register
-from tilestream.store import POINTS, Mark, Tile
+from tilestream.marks import Mark
+from tilestream.store import POINTS, Tile
 from tilestream.tiling import Box
 
 SENSOR = ts.VLP16.model_copy(update={"name": "short", "range_max": 15.0, "azimuth_step_deg": 3.0})

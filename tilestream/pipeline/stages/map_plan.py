@@ -1,8 +1,7 @@
 """The map as a plan sees it: the tables of its tiles, those that are there and those to be made."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 from tilestream.factors.surfels import surfel_mm, surfels_table
 from tilestream.factors.terms import terms_table
@@ -21,7 +20,8 @@ EXPECTED_DENSITY = 100
 any road at 0.2 m [1/m^2]. What a task really reads is checked when it runs."""
 
 
-class TilePoints(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class TilePoints:
     """The points of a tile, as they are or will be."""
 
     identity: str
