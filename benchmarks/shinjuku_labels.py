@@ -209,7 +209,13 @@ def main() -> None:
             knobs_of_the_map(settings, given.out, given.every, given.workers, given.paths)
         return
     found = [
-        labels(settings.model_copy(update={"drive": drive}), given.out, given.every, given.workers)
+        labels(
+            settings.model_copy(update={"drive": drive}),
+            given.out,
+            given.every,
+            given.workers,
+            given.paths,
+        )
         for drive in given.drives
     ]
     for drive, table in zip(given.drives, found, strict=True):

@@ -31,6 +31,7 @@ KNOWN_ONLY_BY = {
     "sklearn": {"forest"},
     "skops": {"forest"},
     "numba": {"kernels"},
+    "embreex": {"simulation"},
     "open3d": {"simulation", "formats"},
     "typer": {"cli"},
 }
