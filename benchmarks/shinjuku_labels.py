@@ -2,6 +2,7 @@
 
     python benchmarks/shinjuku_labels.py [--preset paper] [--out FOLDER] [--every 10] [--workers 1]
     python benchmarks/shinjuku_labels.py --drives 0 1     # the ceiling: two drives of every path
+    python benchmarks/shinjuku_labels.py --against FOLDER # are they those of another run's folder?
     python benchmarks/shinjuku_labels.py --knobs drive    # one phenomenon switched off at a time
     python benchmarks/shinjuku_labels.py --knobs map --paths III
 
@@ -18,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.stats import ks_2samp
 
 import tilestream as ts
 from tilestream.dataflow.localize_tasks import box_around
@@ -121,6 +123,34 @@ def ceiling(first: dict[str, pd.Series], second: dict[str, pd.Series]) -> str:
     return "\n".join(lines)
 
 
+def against(before: pd.Series, after: pd.Series) -> str:
+    """Markdown: two runs' labels, their distributions and the differences at the same scans."""
+    both = pd.DataFrame({"before": before, "after": after})
+    told = both.describe(percentiles=[0.1, 0.25, 0.5, 0.75, 0.9]).drop("count").mul(100)
+    for limit in LIMITS:
+        told.loc[f"> {100 * limit:.0f} cm"] = 100 * (both > limit).mean()
+    lines = [
+        f"| {len(before)} and {len(after)} labels [cm, %] | before | after |",
+        "|---" * 3 + "|",
+    ]
+    lines += [f"| {row.Index} | {row.before:.2f} | {row.after:.2f} |" for row in told.itertuples()]
+    test = ks_2samp(before, after)
+    change = (both["after"] - both["before"]).dropna()
+    return "\n".join(lines) + (
+        f"\n\ntwo-sample Kolmogorov-Smirnov: D = {test.statistic:.3f}, p = {test.pvalue:.2f}\n"
+        f"paired: {len(change)} scans, {(change == 0).sum()} with the same bits, mean change "
+        f"{1000 * change.mean():.3f} mm, largest {1000 * change.abs().max():.3f} mm"
+    )
+
+
+def labels_in(folder: Path, every: int, drive: int) -> pd.Series:
+    """Mean errors [m] that a run left in its folder, by path and number of the scan."""
+    tables = (folder / f"labels-{every}" / f"drive{drive}").glob("*/errors/*.parquet")
+    table = pd.concat({file.stem: pd.read_parquet(file) for file in tables})
+    done = table[table["status"] == "done"].droplevel(1).set_index("scan", append=True)
+    return done["error_mean"].sort_index()
+
+
 def changed(settings: SimulationSettings, changes: dict[str, dict[str, Any]]) -> SimulationSettings:
     """The settings with some fields of their parts set otherwise."""
     parts = {
@@ -198,6 +228,7 @@ def main() -> None:
     parser.add_argument("--knobs", choices=("drive", "map"))
     parser.add_argument("--paths", nargs="+", help="only these; all by default")
     parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--against", type=Path, help="a folder of --out: compare with its labels")
     given = parser.parse_args()
     settings = load_preset(given.preset)
     if given.knobs is not None:
@@ -222,6 +253,11 @@ def main() -> None:
         print(f"drive {drive}, preset {given.preset}:\n\n{table_one(table)}\n")
     for drive, table in zip(given.drives[1:], found[1:], strict=True):
         print(f"drive {drive} from drive {given.drives[0]}:\n\n{ceiling(found[0], table)}\n")
+    if given.against is not None:
+        runs = (
+            labels_in(folder, given.every, given.drives[0]) for folder in (given.against, given.out)
+        )
+        print(against(*runs))
 
 
 if __name__ == "__main__":
