@@ -51,11 +51,17 @@ class Installation:
         for folder in (self.home, self.temporary, self.pycache):
             folder.mkdir()
 
-    def start(self, program: str = SUMS, cache: Path | None = None) -> tuple[list[str], list[str]]:
+    def start(
+        self, program: str = SUMS, *, cache: Path | None = None, home: str | None = None
+    ) -> tuple[list[str], list[str]]:
         """Words and lines that a program prints, to standard output and error."""
         left_out = ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "NUMBA_DISABLE_JIT")
         env = {name: value for name, value in os.environ.items() if name not in left_out}
-        env |= {"PYTHONPATH": str(self.site), "HOME": str(self.home), "TMPDIR": str(self.temporary)}
+        env |= {
+            "PYTHONPATH": str(self.site),
+            "HOME": home or str(self.home),
+            "TMPDIR": str(self.temporary),
+        }
         env |= {"PYTHONDONTWRITEBYTECODE": "1"}
         if cache is not None:
             env["NUMBA_CACHE_DIR"] = str(cache)
@@ -64,7 +70,7 @@ class Installation:
         ran = subprocess.run(
             [*unprivileged(), sys.executable, str(script)],
             env=env,
-            cwd=self.site,
+            cwd=self.temporary,
             capture_output=True,
             text=True,
             check=False,
@@ -111,12 +117,13 @@ def test_a_second_start_reads_what_the_first_compiled(installation: Installation
 
 
 @posix
+@pytest.mark.parametrize("home", [None, "~"], ids=["a home that is missing", "that is not known"])
 def test_a_read_only_installation_without_home_keeps_kernels_in_a_folder_of_the_user(
-    installation: Installation,
+    installation: Installation, home: str | None
 ) -> None:
     installation.make_read_only()
     for hits in ("0", "1"):
-        (folder, found), (line,) = installation.start()
+        (folder, found), (line,) = installation.start(home=home)
         assert (Path(folder).parent, found) == (installation.own, hits)
         assert "NUMBA_CACHE_DIR" in line
     assert stat.S_IMODE(installation.own.stat().st_mode) == 0o700

@@ -1,4 +1,4 @@
-"""tests/oldest.txt, which CI installs, holds the lower bounds of pyproject.toml and nothing else."""
+"""tests/oldest.txt, which CI installs, holds the lower bounds of pyproject.toml and no others."""
 
 import tomllib
 from pathlib import Path
