@@ -15,31 +15,47 @@ Core-seconds (of the process, which has one thread), the smallest of three repea
 """
 
 import argparse
+from pathlib import Path
+
+
+def options() -> argparse.Namespace:
+    """What the command line asks for."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--rows", type=int, default=20_000)
+    parser.add_argument("--run", type=Path, metavar="DIR")
+    parser.add_argument("--json", type=Path)
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    GIVEN = options()  # before what is slow to import
+
 import json
 import os
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from tempfile import TemporaryDirectory
 
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ[name] = "1"
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
-import numpy as np  # noqa: E402
-import pandas as pd  # noqa: E402
-from forest_data import COLUMNS, dataset, drives  # noqa: E402
+import numpy as np
+import pandas as pd
+from forest_data import COLUMNS, dataset, drives
 
-from tilestream.dataflow.estimate_tasks import PredictTask, places_with_factors  # noqa: E402
-from tilestream.dataflow.main_findings import Done, places_of  # noqa: E402
-from tilestream.dataflow.tasks import perform  # noqa: E402
-from tilestream.forest.model_file import load_model, save_model  # noqa: E402
-from tilestream.forest.reasons import contributions  # noqa: E402
-from tilestream.forest.training import predict, train  # noqa: E402
-from tilestream.report import Findings  # noqa: E402
-from tilestream.report.exports import write_geoparquet  # noqa: E402
-from tilestream.tiling import TileKey  # noqa: E402
+from tilestream.dataflow.estimate_tasks import PredictTask, places_with_factors
+from tilestream.dataflow.main_findings import Done, places_of
+from tilestream.dataflow.tasks import perform
+from tilestream.forest.model_file import load_model, save_model
+from tilestream.forest.reasons import contributions
+from tilestream.forest.training import predict, train
+from tilestream.report import Findings
+from tilestream.report.exports import write_geoparquet
+from tilestream.tiling import TileKey
 
 REPEATS = 3
 
@@ -141,21 +157,14 @@ def observed_of(tasks: list[PredictTask]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(path for task in tasks for path in task.observed))
 
 
-def main() -> None:
+def main(given: argparse.Namespace) -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--rows", type=int, default=20_000)
-    parser.add_argument("--run", type=Path, metavar="DIR")
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
-    if options.run:
-        found = [district(options.run)]
+    if given.run:
+        found = [district(given.run)]
     else:
         file = Path(os.environ.get("TMPDIR", "/tmp")) / f"predict-{os.getpid()}.skops"
         try:
-            found = [measure(recipe, options.rows, file) for recipe in ("default", "paper")]
+            found = [measure(recipe, given.rows, file) for recipe in ("default", "paper")]
         finally:
             file.unlink(missing_ok=True)
     for figures in found:
@@ -165,9 +174,9 @@ def main() -> None:
                 for name, value in figures.items()
             )
         )
-    if options.json:
-        options.json.write_text(json.dumps(found, indent=2))
+    if given.json:
+        given.json.write_text(json.dumps(found, indent=2))
 
 
 if __name__ == "__main__":
-    main()
+    main(GIVEN)
