@@ -1,13 +1,8 @@
 """A simulation of a tiny city from settings to logs: sameness, resuming, refusals, reading back."""
 
 import json
-import os
 import re
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from collections import namedtuple
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +12,7 @@ import distributed
 import numpy as np
 import pytest
 import yaml
+from killed import killed_after
 
 import tilestream as ts
 from tilestream.cli import run
@@ -138,14 +134,13 @@ def test_a_killed_run_goes_on_to_the_same_bytes(
     settings: SimulationSettings, made: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "killed"
-    arguments = (settings.model_dump_json(), str(out))
-    child = subprocess.Popen([sys.executable, "-c", SIMULATE, *arguments])
-    deadline = time.monotonic() + 120
-    while not list(out.glob("parts/*.npz")) and child.poll() is None:
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
-    os.kill(child.pid, signal.SIGKILL)
-    assert child.wait() == -signal.SIGKILL
+    call = (
+        "from tilestream.dataflow.simulate import simulate; "
+        "from tilestream.simulation.settings import SimulationSettings; "
+        "settings = SimulationSettings.model_validate_json(sys.argv[1]); "
+        "simulate(settings, sys.argv[2], watch=watch)"
+    )
+    killed_after(1, "scan", call, settings.model_dump_json(), str(out))
     before = files(out)
     assert before.keys() != files(made).keys()
     simulate(settings, out)
