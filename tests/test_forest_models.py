@@ -82,10 +82,10 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> str:
 def test_irrelevant_smooth_factors_shine_on_the_random_split_and_fail_on_blocks(
     quick: str,
 ) -> None:
-    """In the mean of five worlds, of which each is some 25 independent points for a forest.
+    """In the mean of five worlds: one has so few independent points that chance decides.
 
-    The skill is 0.87 at random and -0.30 apart, with standard errors of 0.01 and 0.11; the errors
-    apart are 10.7 times as large, with one of 0.4. So all limits are four and more away.
+    The skill is 0.87 at random and -0.25 apart, with standard errors of 0.01 and 0.1; the errors
+    apart are 10.3 times as large, with one of 0.7. So all limits are four and more away.
     """
     at_random, by_path, by_block = [], [], []
     for seed in range(5, 10):
