@@ -1,6 +1,6 @@
 """How fast a model is applied: rows per second of one core, by part.
 
-    python benchmarks/predict.py [--rows N] [--json FILE]
+    python benchmarks/predict.py [--rows N] [--share S] [--json FILE]
     python benchmarks/predict.py --run DIR [--json FILE]
 
 Without a run: trains both recipes on synthetic drives as long as the paper's five paths, then times
@@ -23,9 +23,10 @@ def options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--rows", type=int, default=20_000)
-    parser.add_argument("--run", type=Path, metavar="DIR")
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--rows", type=int, default=20_000, help="places to estimate")
+    parser.add_argument("--share", type=float, default=1.0, help="of the paths that are learnt")
+    parser.add_argument("--run", type=Path, metavar="DIR", help="a finished run directory")
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
     return parser.parse_args()
 
 
@@ -45,7 +46,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 import numpy as np
 import pandas as pd
-from forest_data import COLUMNS, dataset, drives
+from forest_data import COLUMNS, LENGTHS, dataset, drives
 
 from tilestream.dataflow.estimate_tasks import PredictTask, places_with_factors
 from tilestream.dataflow.main_findings import Done, places_of
@@ -70,10 +71,11 @@ def seconds(work: Callable[[], object]) -> float:
     return best
 
 
-def measure(recipe: str, rows: int, file: Path) -> dict[str, float | str]:
-    """Figures of one recipe."""
+def measure(recipe: str, rows: int, share: float, file: Path) -> dict[str, float | str]:
+    """Figures of one recipe, trained on the first part of each path."""
+    lengths = {path: round(share * metres) for path, metres in LENGTHS.items()}
     begin = time.process_time()
-    save_model(train(dataset(0), recipe=recipe), file)
+    save_model(train(dataset(0, lengths=lengths), recipe=recipe), file)
     trained = time.process_time() - begin
     model = load_model(file)
     some = drives(1, {"a": 2000})[0]
@@ -164,7 +166,8 @@ def main(given: argparse.Namespace) -> None:
     else:
         file = Path(os.environ.get("TMPDIR", "/tmp")) / f"predict-{os.getpid()}.skops"
         try:
-            found = [measure(recipe, given.rows, file) for recipe in ("default", "paper")]
+            recipes = ("default", "paper")
+            found = [measure(recipe, given.rows, given.share, file) for recipe in recipes]
         finally:
             file.unlink(missing_ok=True)
     for figures in found:

@@ -26,7 +26,7 @@ SMALLEST = (
     "figures.py --spacing 1.0 --figures figures",
     "figures_simulation.py --figures figures",
     "ingest.py --points 0.01 --repeats 1",
-    "predict.py --rows 10",
+    "predict.py --rows 10 --share 0.05",
     "registration.py --starts 1",
     "scale.py --tiles 1 --size 20",
     "shinjuku_labels.py --size small --paths III --every 40 --out labels",
