@@ -281,7 +281,7 @@ def held_by_new_blocks(bias: float, blocks: int, seed: int) -> float:
     """
     rng, held = np.random.default_rng(seed), []
     names = np.repeat([f"b{k:02d}" for k in range(blocks)], 40)
-    for _ in range(600):
+    for _ in range(150 + round(900 * bias)):  # the more, the more blocks differ
         shift = bias * rng.normal(size=(blocks + 8, 1)) + 0.4 * rng.normal(size=(blocks + 8, 40))
         actual, estimate = 0.1 * np.exp(shift), np.full((blocks + 8, 40), 0.1)
         interval = calibrate(actual[:blocks].ravel(), estimate[:blocks].ravel(), names)
