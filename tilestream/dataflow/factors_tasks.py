@@ -19,7 +19,7 @@ from tilestream.tables import is_done, write_table
 from tilestream.tiling import MM_PER_M, TileKey
 from tilestream.version import VERSION
 
-FACTORS_VERSION = 1
+FACTORS_VERSION = 2
 """Raise it when the factors that are made from the same terms change."""
 TERMS_BYTES = 600_000_000
 """Memory of a terms task beyond the interpreter: points of a tile, cells around it, pairs."""

@@ -16,6 +16,7 @@ from tilestream.errors import PoseError, RegistrationError, TaskError, UsageErro
 from tilestream.formats.deskew import Sweep, deskew
 from tilestream.formats.lesser import as_lesser
 from tilestream.formats.mcap import ScanLog, open_log
+from tilestream.kernels.fixed_order import norms
 from tilestream.localization import (
     FINE_CELL,
     refined_pose,
@@ -31,7 +32,7 @@ from tilestream.tables import is_done, read_mark, read_tables, write_table
 from tilestream.tiling import MM_PER_M, Box, TileKey
 from tilestream.version import VERSION
 
-LABEL_VERSION = 1
+LABEL_VERSION = 2
 """Raise it when the labels that are made from the same scans and cells change."""
 MARGIN = 10.0
 """Map around what a scan sees: the way a start can go, and a cell [m]."""
@@ -347,7 +348,7 @@ def _register_scan(
         "scan": sample.scan,
         "stamp_ns": scan.stamp_ns,
         "start": np.arange(*task.batch),
-        "distance": np.linalg.norm(starts[:, :3, 3] - T_map_true[:3, 3], axis=1),
+        "distance": norms(starts[:, :3, 3] - T_map_true[:3, 3]),
         **start_errors(T_map_true, found.T_map_lidar),
         **{name: getattr(found, name) for name in ("converged", "iterations", "score", "nvtl")},
         "hits": found.hits,
@@ -373,7 +374,7 @@ def _cells_around(
     store: TileStore, scan: Scan, T_map_lidar: Float64, cell_size: float, map_state: str
 ) -> Cells:
     """The cells of the tiles in reach of a scan."""
-    ranges = np.linalg.norm(scan.points[:, :2], axis=1)
+    ranges = norms(scan.points[:, :2])
     reach = (float(ranges.max()) if ranges.size else 0.0) + MARGIN
     box = box_around(T_map_lidar[None, :2, 3], reach)
     return _cells_of(store.url, tuple(store.grid.keys_over(box)), cell_size, map_state)

@@ -26,7 +26,7 @@ from tilestream.tables import is_done, write_table
 from tilestream.tiling import TileKey
 from tilestream.version import VERSION
 
-OBSERVE_VERSION = 2
+OBSERVE_VERSION = 3
 """Raise it when what is observed from the same surfels and cells changes."""
 SURFELS_BYTES = 400_000_000
 """Memory of a surfels task beyond the interpreter: the points of a tile, some of their planes."""
