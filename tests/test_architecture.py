@@ -20,6 +20,7 @@ FLOORS = (
     ("factors", "forest"),
     ("report", "ingest"),
     ("dataflow",),
+    ("apps",),
     ("cli",),
     ("__init__", "__main__"),
 )
@@ -32,7 +33,7 @@ KNOWN_ONLY_BY = {
     "skops": {"forest"},
     "numba": {"kernels"},
     "embreex": {"simulation"},
-    "open3d": {"simulation", "formats"},
+    "open3d": {"simulation", "apps"},
     "typer": {"cli"},
 }
 
@@ -40,7 +41,7 @@ KNOWN_ONLY_BY = {
 def step_in_dataflow(name: str) -> int:
     """plan < tasks < dashboard < telling < run < a job's tasks < the jobs < those made of jobs."""
     first = ("plan", "progress", "tasks", "dashboard", "telling", "run", "run_settings")
-    above = {"compare": 7, "estimate_tasks": 7, "main_plan": 8, "main_findings": 8}
+    above = {"run_folder": 0, "compare": 7, "estimate_tasks": 7, "main_plan": 8, "main_findings": 8}
     above |= {"main_estimate": 9, "main_forecast": 10, "main_job": 10}
     if name in above:
         return above[name]
@@ -107,7 +108,7 @@ def test_no_import_hides_inside_a_function(path: Path) -> None:
         for inner in ast.walk(node)
         if isinstance(inner, ast.Import | ast.ImportFrom)
     ]
-    optional = {"e57.py", "raycast.py", "telling.py"}
+    optional = {"e57.py", "raycast.py", "telling.py", "view.py"}
     assert path.name in optional or hidden == []
 
 

@@ -121,9 +121,8 @@ def _factors(task: FactorsTask) -> int:
     found = factors(store, positions, looking.sensor, looking.cell_size, looking.which, cache)
     frame = pd.concat([frame, found], axis=1)
     documented = (*PLACE_COLUMNS, *COLUMNS, *STATUS_COLUMNS)
-    write_table(
-        task.out, frame, documented, {"identity": task.identity, "data_set": facts(looking)}
-    )
+    mark = {"identity": task.identity, "data_set": facts(looking), "store": store.address}
+    write_table(task.out, frame, documented, mark)
     return len(frame)
 
 

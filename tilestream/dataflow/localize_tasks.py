@@ -328,7 +328,12 @@ def _register(task: RegisterTask) -> int:
             rows.append(found)
             facts[sample.number] = fact | {"reason": ""}
     frame = pd.concat(rows, ignore_index=True).astype({c.name: c.dtype for c in START_COLUMNS})
-    mark = {"identity": task.identity, "samples": facts, "data_set": task.measuring.identity()}
+    mark = {
+        "identity": task.identity,
+        "samples": facts,
+        "data_set": task.measuring.identity(),
+        "store": store.address,
+    }
     write_table(task.out, frame, START_COLUMNS, mark)
     return len(frame)
 
