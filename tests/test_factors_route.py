@@ -14,6 +14,7 @@ from scenes import PLACES
 
 import tilestream as ts
 from tilestream.cli import run
+from tilestream.dataflow.run_folder import map_of
 from tilestream.errors import SourceError, UsageError
 from tilestream.factors.rows import samples_by_tile
 from tilestream.formats.pcd import write_pcd
@@ -60,6 +61,11 @@ def test_rows_follow_the_route_and_say_what_the_factors_of_their_places_are(
     assert (table["status"] == "done").all()
     direct = ts.factors(store, points.positions, sensor=SENSOR, which="all")
     pd.testing.assert_frame_equal(table[direct.columns.tolist()], direct, check_dtype=False)
+
+
+def test_the_tables_name_their_map(store: ts.TileStore, table: pd.DataFrame, street: Path) -> None:
+    assert len(table)
+    assert map_of(street.parent / "out").address == store.address
 
 
 def winding(name: str, seed: int) -> ts.Route:

@@ -20,6 +20,7 @@ from tilestream.cli import run
 from tilestream.config import StartSettings
 from tilestream.dataflow.localize_drive import REACH, choose_samples
 from tilestream.dataflow.localize_tasks import ERROR_COLUMNS, START_COLUMNS, Reading
+from tilestream.dataflow.run_folder import map_of
 from tilestream.dataflow.tasks import Outcome
 from tilestream.errors import PartialError, PoseError, TileNotReadyError, UsageError
 from tilestream.formats.lesser import as_lesser
@@ -187,6 +188,10 @@ def test_a_lesser_sensor_changes_the_labels_and_is_recorded(
         mark = read_mark(str(path))
         assert mark is not None
         assert mark["data_set"]["as_sensor"] == "8 beams, 12 m, rear blind 120 deg"
+
+
+def test_the_tables_name_their_map(store: ts.TileStore, plain: tuple[pd.DataFrame, Path]) -> None:
+    assert map_of(plain[1]).address == store.address
 
 
 def test_a_refined_true_pose_is_recorded_and_used(

@@ -86,7 +86,8 @@ def test_a_larger_map_is_thinned_by_the_same_share_everywhere(store: ts.TileStor
     shown = scene_of(store.url, points=500)
     again = scene_of(store.url, points=500)
     np.testing.assert_array_equal(shown.points, again.points)
-    assert 500 - len(store.keys()) <= len(shown.points) <= 500
+    assert len(shown.points) == 500
+    assert len(scene_of(store.url, points=1).points) == 1
     for key in store.keys():
         core = store.grid.core(key)
         at = np.round((shown.points + shown.origin)[:, :2] * 1000)
@@ -226,7 +227,7 @@ def display(tmp_path: Path) -> Iterator[tuple[str, Path]]:
     pytest.importorskip("open3d", reason="Open3D's libraries are absent", exc_type=ImportError)
     read, write = os.pipe()
     server = subprocess.Popen(
-        ["Xvfb", "-displayfd", str(write), "-screen", "0", "1600x1000x24", "-fbdir", str(tmp_path)],
+        ["Xvfb", "-displayfd", str(write), "-screen", "0", "1400x900x24", "-fbdir", str(tmp_path)],
         pass_fds=[write],
         stderr=subprocess.DEVNULL,
     )
@@ -260,15 +261,19 @@ def test_the_window_shows_map_and_route_until_it_is_closed(
     name, screen = display
     command = [sys.executable, "-m", "tilestream", "view", str(run_dir)]
     process = subprocess.Popen(
-        command, env=os.environ | {"DISPLAY": name}, stdout=subprocess.PIPE, text=True
+        command,
+        env=os.environ | {"DISPLAY": name},
+        stdout=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # ignored in background
     )
     try:
-        until = time.monotonic() + 120.0
+        until = time.monotonic() + 600.0
         while min(map_and_route(pixels_of(screen))) < 300 and process.poll() is None:
-            assert time.monotonic() < until, "no picture within two minutes"
-            time.sleep(0.2)
+            assert time.monotonic() < until, "no picture within ten minutes"
+            time.sleep(0.5)
         process.send_signal(signal.SIGINT)
-        told, _ = process.communicate(timeout=60.0)
+        told, _ = process.communicate(timeout=600.0)
     finally:
         process.kill()
     assert process.returncode == 130

@@ -29,8 +29,8 @@ LOWEST, HIGHEST = np.array([0.22, 0.26, 0.31]), np.array([0.93, 0.95, 0.97])
 """Colours of the heights, greys: the colours of errors must stand out."""
 TAILS = 0.02
 """Share of the heights, and of the map's extent, that is left out at each end: strays."""
-SMALLEST, SHARE = 0.8, 1 / 150
-"""Radius of a place: at least this [m], and this share of what is seen."""
+SMALLEST, LARGEST, SHARE = 0.8, 5.0, 1 / 150
+"""Radius of a place: at least and at most this [m], and between them this share of what is seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +87,7 @@ class Scene:
     @property
     def radius(self) -> float:
         """Radius of a place, large enough to be seen [m]."""
-        return max(SMALLEST, SHARE * float(np.ptp(self.seen, axis=0).max()))
+        return float(np.clip(SHARE * np.ptp(self.seen, axis=0).max(), SMALLEST, LARGEST))
 
     def drawn(self) -> NDArray[np.int64]:
         """Rows of the places to draw: of those within a radius of each other one, by preference
@@ -124,12 +124,8 @@ def scene_of(
     store = map_of(place)
     tiles, counts = _tiles(store, tile)
     total, first = sum(counts), np.array(store.grid.origin_mm(tiles[0])) / MM_PER_M
-    kept = np.concatenate(
-        [
-            _thinned(store, k, n * min(points, total) // total)
-            for k, n in zip(tiles, counts, strict=True)
-        ]
-    )
+    shares = np.diff(np.cumsum([0, *counts]) * min(points, total) // total)
+    kept = np.concatenate([_thinned(store, *each) for each in zip(tiles, shares, strict=True)])
     at, error, measured = route_of(place)
     if tile is not None:
         here = _inside(store.grid.core(tiles[0]), at)

@@ -22,7 +22,7 @@ from tilestream.formats.rows import writing_whole
 from tilestream.kernels import cells as _numba_first  # noqa: F401  Open3D brings an older libtbb
 from tilestream.report.pictures import NOTHING
 
-WIDTH, HEIGHT = 1600, 1000
+WIDTH, HEIGHT = 1280, 800
 """Of the window [pixels]."""
 POINT_SIZE = 3.0
 """Of a map point [pixels]."""
@@ -181,7 +181,7 @@ def _balls(scene: Scene) -> Any:
     """All places as one mesh, which is drawn at once."""
     open3d, rows = _open3d(), scene.drawn()
     vector = open3d.utility.Vector3dVector
-    ball = open3d.geometry.TriangleMesh.create_sphere(1.0, resolution=8)
+    ball = open3d.geometry.TriangleMesh.create_sphere(1.0, resolution=6)
     normals = np.asarray(ball.vertices)
     radius = scene.radius * np.where(scene.measured[rows], 1.0, ESTIMATED)
     corners = scene.places[rows, None] + radius[:, None, None] * normals

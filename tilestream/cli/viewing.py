@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 from rich.text import Text
 
@@ -46,7 +47,7 @@ def legend(scene: Scene) -> list[Text]:
     low, high = scene.height_range
     told = f"map: {len(scene.points):,} of {scene.total:,} points of {len(scene.tiles):,} tiles, "
     lines = [Text(told + f"from dark at {low:.1f} m to bright at {high:.1f} m")]
-    measured, known = scene.measured.sum(), (scene.error == scene.error).sum()
+    measured, known = scene.measured.sum(), np.isfinite(scene.error).sum()
     if len(scene.places):
         told = f"route: {measured:,} places measured (large), {known - measured:,} estimated "
         lines.append(Text(told + f"(small), {len(scene.places) - known:,} neither (grey)"))
