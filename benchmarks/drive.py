@@ -1,16 +1,39 @@
 """A real drive end to end: map from every second scan, the others localized from 317 starts each.
 
-    python benchmarks/drive.py [LOG] [--out FOLDER] [--workers N]
+    python benchmarks/drive.py [LOG] [--out FOLDER] [--workers N] [--figures FOLDER]
 
 As recorded, and as lesser sensors would have seen it, with the default and the production matcher.
-Prints the tables of RESULTS.md and draws benchmarks/figures/drive_errors.png (needs matplotlib).
-LOG is an MCAP log with point clouds and poses; default: the drive under TILESTREAM_DATA.
+Prints the tables of RESULTS.md and draws drive_errors.png (needs matplotlib). LOG is an MCAP log
+with point clouds and poses; default: the drive under TILESTREAM_DATA.
 """
 
 import argparse
 import os
-import tempfile
 from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+DATA = Path(os.environ.get("TILESTREAM_DATA", HERE.parents[1] / "shared" / "data"))
+
+
+def options() -> argparse.Namespace:
+    """What the command line asks for."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("log", type=Path, nargs="?", default=DATA / "kitti_drive" / "drive.mcap")
+    parser.add_argument("--out", type=Path, help="keep map and tables here; continues there")
+    parser.add_argument("--workers", type=int, default=1, help="worker processes")
+    parser.add_argument("--figures", type=Path, default=HERE / "figures", help="draw into this")
+    given = parser.parse_args()
+    if not given.log.exists():
+        parser.error(f"no log at {given.log}: name one, or set TILESTREAM_DATA")
+    return given
+
+
+if __name__ == "__main__":
+    GIVEN = options()  # before what is slow to import
+
+import tempfile
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
@@ -24,9 +47,6 @@ from tilestream.pipeline.engine.plan import DEFAULT_MEMORY
 from tilestream.pipeline.stages.drive_scans import Reading
 
 mpl.use("Agg")
-HERE = Path(__file__).resolve().parent
-DATA = Path(os.environ.get("TILESTREAM_DATA", HERE.parents[1] / "shared" / "data"))
-FIGURE = HERE / "figures" / "drive_errors.png"
 MAPPED = ts.ScanSelection(every=2, offset=0)
 LOCALIZED = ts.ScanSelection(every=2, offset=1)
 MATCHERS = {
@@ -102,7 +122,7 @@ def worst_table(labels: pd.DataFrame) -> str:
     return "\n".join(lines)
 
 
-def draw(store: ts.TileStore, found: dict[str, pd.DataFrame]) -> None:
+def draw(store: ts.TileStore, found: dict[str, pd.DataFrame], path: Path) -> None:
     """The drive in its map, coloured by error, a panel per sensor, each with its own scale."""
     points = np.concatenate([store.tile(key).points() for key in store.keys()])
     labels = next(iter(found.values()))
@@ -114,8 +134,9 @@ def draw(store: ts.TileStore, found: dict[str, pd.DataFrame]) -> None:
         draw_panel(axes, points[seen][::2], table, title)
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="map x [m]")
     panels[0].set_ylabel("map y [m]")
-    figure.savefig(FIGURE, dpi=80, pil_kwargs={"optimize": True})
-    print(f"{FIGURE}: {FIGURE.stat().st_size / 1e3:.0f} kB")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=80, pil_kwargs={"optimize": True})
+    print(f"{path}: {path.stat().st_size / 1e3:.0f} kB")
 
 
 def draw_panel(axes: Axes, points: np.ndarray, labels: pd.DataFrame, title: str) -> None:
@@ -141,23 +162,19 @@ def draw_panel(axes: Axes, points: np.ndarray, labels: pd.DataFrame, title: str)
     axes.set_aspect("equal")
 
 
-def main() -> None:
+def main(given: argparse.Namespace) -> None:
     """Measure, print, draw."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("log", type=Path, nargs="?", default=DATA / "kitti_drive" / "drive.mcap")
-    parser.add_argument("--out", type=Path, help="keep map and tables here; continues there")
-    parser.add_argument("--workers", type=int, default=1, help="worker processes")
-    arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
-        folder = arguments.out or Path(scratch)
-        found = measure(arguments.log, folder, arguments.workers)
+        folder = given.out or Path(scratch)
+        found = measure(given.log, folder, given.workers)
         print(f"\n{error_table(found)}")
         for sensor in SENSORS:
             print(f"\nworst, {sensor}, definite:\n\n{worst_table(found[sensor, 'definite'])}")
         by_mean = {sensor: found[sensor, "definite"]["error_mean"].mean() for sensor in SENSORS}
         chosen = ("as recorded", max(by_mean, key=by_mean.__getitem__))
-        draw(ts.open_store(str(folder / "map.zarr")), {s: found[s, "definite"] for s in chosen})
+        store = ts.open_store(str(folder / "map.zarr"))
+        draw(store, {s: found[s, "definite"] for s in chosen}, given.figures / "drive_errors.png")
 
 
 if __name__ == "__main__":
-    main()
+    main(GIVEN)

@@ -9,6 +9,19 @@ Read from the run directory. Lengths are centimetres.
 import argparse
 from pathlib import Path
 
+
+def options() -> argparse.Namespace:
+    """What the command line asks for."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("run_dir", type=Path)
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    GIVEN = options()  # before what is slow to import
+
 import pandas as pd
 from scipy.stats import spearmanr
 
@@ -37,12 +50,10 @@ def table(run_dir: Path) -> str:
     return "\n".join(lines)
 
 
-def main() -> None:
+def main(given: argparse.Namespace) -> None:
     """Print the table of a run directory."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("run_dir", type=Path)
-    print(table(parser.parse_args().run_dir))
+    print(table(given.run_dir))
 
 
 if __name__ == "__main__":
-    main()
+    main(GIVEN)

@@ -7,8 +7,22 @@ Everything is read from the run directory; nothing is computed anew. Lengths are
 """
 
 import argparse
-import json
 from pathlib import Path
+
+
+def options() -> argparse.Namespace:
+    """What the command line asks for."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("run_dir", type=Path)
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    GIVEN = options()  # before what is slow to import
+
+import json
 from typing import Any
 
 import pandas as pd
@@ -125,11 +139,8 @@ def table_cost(run: dict[str, Any]) -> str:
     return markdown(lines, ["stage", "tasks", "work", "core-seconds"])
 
 
-def main() -> None:
+def main(given: argparse.Namespace) -> None:
     """Print the tables of a run directory."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("run_dir", type=Path)
-    given = parser.parse_args()
     evaluation = json.loads((given.run_dir / "tables" / "evaluation.json").read_text())
     run = json.loads((given.run_dir / "run.json").read_text())
     print(f"## Errors\n\n{table_one(given.run_dir)}\n")
@@ -154,4 +165,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(GIVEN)

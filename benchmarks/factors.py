@@ -1,4 +1,4 @@
-"""What the factors cost: `python benchmarks/factors.py [--tiles 4,100] [--literal 2]`.
+"""What the factors cost: `python benchmarks/factors.py [--tiles 4 100] [--literal 2]`.
 
 Tables in Markdown, all from one run in one process on one thread; times are CPU times:
 
@@ -9,6 +9,25 @@ Tables in Markdown, all from one run in one process on one thread; times are CPU
 """
 
 import argparse
+
+
+def options() -> argparse.Namespace:
+    """What the command line asks for."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--tiles", type=int, nargs="+", default=[4, 100], help="lengths of the street, in tiles"
+    )
+    parser.add_argument("--literal", type=int, default=2, help="sample points evaluated literally")
+    parser.add_argument("--shifts", type=int, default=21, help="shifts of score_H timed literally")
+    parser.add_argument("--spacing", type=float, default=0.13, help="of the tile's surfaces [m]")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    GIVEN = options()  # before what is slow to import
+
 import ctypes
 import os
 import resource
@@ -24,7 +43,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 import literal
-from streets import TILE, Floats, long_street, street_tile
+from street_tiles import TILE, Floats, long_street, street_tile
 
 import tilestream as ts
 from tilestream.factors.catalogue import CRITERIA, columns_of
@@ -41,8 +60,8 @@ from tilestream.pipeline.jobs.along_routes import factors_along
 from tilestream.records import Route
 
 CELL = 2.0
-FINE, COARSE = 0.13, 0.5
-"""Spacing of the sampled surfaces [m]: a million points a tile, and an eighth of it."""
+COARSE = 0.5
+"""Spacing of the surfaces of a long street [m]: an eighth of a million points a tile."""
 
 
 def seconds(function: Callable[[], Any], repeats: int = 3) -> float:
@@ -230,20 +249,15 @@ def cost_per_tile(folder: Path, tiles: list[int]) -> None:
     show("Cost per tile: a street of tiles of 125 k points, cells to tables", head, rows[1:])
 
 
-def main() -> None:
+def main(given: argparse.Namespace) -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("--tiles", default="4,100", help="lengths of the street, in tiles")
-    parser.add_argument("--literal", type=int, default=2, help="sample points evaluated literally")
-    parser.add_argument("--shifts", type=int, default=21, help="shifts of score_H timed literally")
-    given = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        store = ingested(folder / "tile", [street_tile(0, FINE)], 0.2)
+        store = ingested(folder / "tile", [street_tile(0, given.spacing)], 0.2)
         cost_of_terms(store)
         cost_of_sample_points(store, given.literal, given.shifts)
-        cost_per_tile(folder, [int(n) for n in given.tiles.split(",")])
+        cost_per_tile(folder, given.tiles)
 
 
 if __name__ == "__main__":
-    main()
+    main(GIVEN)

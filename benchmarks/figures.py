@@ -1,4 +1,4 @@
-"""Pictures of the factors into benchmarks/figures/: `python benchmarks/figures.py`.
+"""Pictures of the factors: `python benchmarks/figures.py [--spacing M] [--figures FOLDER]`.
 
 Routes and maps come from one drive through what a city can be: canyon, crossing, tunnel, park,
 empty lot. A sample point sees 100 m, through walls (definitions, section 2), so each section shows
@@ -7,8 +7,25 @@ a tunnel, a crossing and a canyon each alone. Needs matplotlib.
 """
 
 import argparse
-import tempfile
 from pathlib import Path
+
+FIGURES = Path(__file__).resolve().parent / "figures"
+
+
+def options() -> argparse.Namespace:
+    """What the command line asks for."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--spacing", type=float, default=0.2, help="of the sampled surfaces [m]")
+    parser.add_argument("--figures", type=Path, default=FIGURES, help="folder of the pictures")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    GIVEN = options()  # before what is slow to import
+
+import tempfile
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
@@ -18,7 +35,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from pandas import DataFrame
 from scipy.spatial import cKDTree
-from streets import SECTION, SECTIONS, Floats, drive, section
+from street_tiles import SECTION, SECTIONS, Floats, drive, section
 
 import tilestream as ts
 from tilestream.factors.catalogue import COLUMNS, columns_of
@@ -28,7 +45,6 @@ from tilestream.factors.vicinity import vicinity_sums
 from tilestream.formats.pcd import write_pcd
 
 mpl.use("Agg")
-FIGURES = Path(__file__).resolve().parent / "figures"
 EYE, MIDDLE = 2.08, 50.0
 """Height of the lidar, and y of the road's middle [m]."""
 LENGTH = SECTION * len(SECTIONS)
@@ -148,38 +164,36 @@ def store_of(points: Floats, folder: Path) -> ts.TileStore:
     return ts.ingest([folder / "points.pcd"], folder / "map.zarr", map_leaf=0.2)
 
 
-def save(figure: Figure, name: str) -> None:
+def save(figure: Figure, path: Path) -> None:
     """Write a picture and say so."""
-    path = FIGURES / f"{name}.png"
     figure.savefig(path, dpi=78)
     plt.close(figure)
     print(f"{path}: {path.stat().st_size / 1024:.0f} kB")
 
 
-def main() -> None:
+def main(given: argparse.Namespace) -> None:
     """Make the maps, look at them everywhere, draw."""
-    parser = argparse.ArgumentParser(description="Pictures of the factors")
-    parser.add_argument("--spacing", type=float, default=0.2, help="of the sampled surfaces [m]")
-    given = parser.parse_args()
-    FIGURES.mkdir(exist_ok=True)
+    given.figures.mkdir(parents=True, exist_ok=True)
     points = drive(0, given.spacing)
     with tempfile.TemporaryDirectory() as name:
         cache = TermsCache(store_of(points, Path(name) / "drive"), 2.0)
         x = np.arange(2.0, LENGTH - 1.0, 1.0)
         table = along(cache, x, np.full(len(x), MIDDLE))
         paper, robust = ([c.name for c in columns_of(kind)] for kind in ("faithful", "robust"))
-        save(
-            route_figure(x, table, paper, "The paper's 20 factors along a drive"), "route_faithful"
-        )
-        save(route_figure(x, table, robust, "Their robust twins along it"), "route_robust")
         grid_x, grid_y = on_the_ground(points, 2.0)
-        save(map_figure(points, grid_x, grid_y, along(cache, grid_x, grid_y)), "normal_entropy_map")
         stores = {
             place: store_of(section(place, 0, given.spacing), Path(name) / place)
             for place in ("tunnel", "crossing", "canyon")
         }
-        save(field_figure(stores), "score_fields")
+        pictures = {
+            "route_faithful": route_figure(x, table, paper, "The paper's 20 factors along a drive"),
+            "route_robust": route_figure(x, table, robust, "Their robust twins along it"),
+            "normal_entropy_map": map_figure(points, grid_x, grid_y, along(cache, grid_x, grid_y)),
+            "score_fields": field_figure(stores),
+        }
+        for picture, figure in pictures.items():
+            save(figure, given.figures / f"{picture}.png")
 
 
 if __name__ == "__main__":
-    main()
+    main(GIVEN)

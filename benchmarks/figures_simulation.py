@@ -1,13 +1,31 @@
 """Pictures of the simulated Shinjuku: district and paths, scans and map at its special spots.
 
     python benchmarks/figures_simulation.py [--preset paper|physical] [--labels FOLDER]
+        [--figures FOLDER]
 
-Writes benchmarks/figures/simulation_*.png (needs matplotlib); with the folder of labels that
+Writes simulation_*.png (needs matplotlib); with the folder of labels that
 shinjuku_labels.py left (`…/labels-10/drive0`) also a map of the errors.
 """
 
 import argparse
 from pathlib import Path
+
+FIGURES = Path(__file__).resolve().parent / "figures"
+
+
+def options() -> argparse.Namespace:
+    """What the command line asks for."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--preset", default="physical")
+    parser.add_argument("--labels", type=Path, help="folder of labels: draws them too")
+    parser.add_argument("--figures", type=Path, default=FIGURES, help="folder of the pictures")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    GIVEN = options()  # before what is slow to import
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
@@ -21,7 +39,6 @@ from tilestream.simulation.settings import load_preset
 from tilestream.simulation.survey import survey
 
 mpl.use("Agg")
-FIGURES = Path(__file__).resolve().parent / "figures"
 PLACES = (
     ("canyon: dense shopping street", "IV", 300),
     ("wide crossing", "I", 500),
@@ -40,7 +57,7 @@ COLOURS = {
 }
 
 
-def district(city: City) -> None:
+def district(city: City, path: Path) -> None:
     """Map of the district with the paths coloured by what their stretches are."""
     fig, ax = plt.subplots(figsize=(16, 9.5))
     edges = np.stack([city.footprints.start, city.footprints.end], axis=1)
@@ -66,11 +83,11 @@ def district(city: City) -> None:
     ax.set(aspect="equal", xlabel="east [m]", ylabel="north [m]")
     ax.set_title("Simulated Shinjuku on real footprints (Project PLATEAU, CC BY 4.0)")
     fig.tight_layout()
-    fig.savefig(FIGURES / "simulation_district.png", dpi=70)
+    fig.savefig(path, dpi=70)
     plt.close(fig)
 
 
-def spots(city: City) -> None:
+def spots(city: City, path: Path) -> None:
     """Panorama, bird's-eye view of a scan, and the map around it, at each kind of place."""
     fig, axes = plt.subplots(
         len(PLACES), 3, figsize=(19, 4.6 * len(PLACES)), width_ratios=(2.0, 1, 1)
@@ -98,11 +115,11 @@ def spots(city: City) -> None:
         )
         mapped.set(xlim=(-60, 60), ylim=(-60, 60), aspect="equal", title="map of 24 m, one pass")
     fig.tight_layout()
-    fig.savefig(FIGURES / "simulation_spots.png", dpi=55)
+    fig.savefig(path, dpi=55)
     plt.close(fig)
 
 
-def errors(city: City, folder: Path, preset: str) -> None:
+def errors(city: City, folder: Path, preset: str, path: Path) -> None:
     """Map of the measured errors with the special spots named, and the errors along each path."""
     driven = [street for street in city.streets if street.driven]
     fig = plt.figure(figsize=(17, 15))
@@ -137,25 +154,19 @@ def errors(city: City, folder: Path, preset: str) -> None:
     low, high = everything.min(axis=0) - 40, everything.max(axis=0) + 40
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     ax.set_title(f"Measured localization error, preset {preset} (buildings: PLATEAU, CC BY 4.0)")
-    fig.savefig(FIGURES / "simulation_errors.png", dpi=60, bbox_inches="tight")
+    fig.savefig(path, dpi=60, bbox_inches="tight")
     plt.close(fig)
 
 
-def main() -> None:
+def main(given: argparse.Namespace) -> None:
     """Draw everything."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--preset", default="physical")
-    parser.add_argument("--labels", type=Path)
-    given = parser.parse_args()
     city = build_city(load_preset(given.preset), check=False)
-    FIGURES.mkdir(exist_ok=True)
+    given.figures.mkdir(parents=True, exist_ok=True)
     if given.labels is not None:
-        errors(city, given.labels, given.preset)
-    district(city)
-    spots(city)
+        errors(city, given.labels, given.preset, given.figures / "simulation_errors.png")
+    district(city, given.figures / "simulation_district.png")
+    spots(city, given.figures / "simulation_spots.png")
 
 
 if __name__ == "__main__":
-    main()
+    main(GIVEN)

@@ -9,6 +9,22 @@ leaves it. The log is the real drive under TILESTREAM_DATA where it is there, el
 """
 
 import argparse
+
+
+def options() -> argparse.Namespace:
+    """What the command line asks for."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--points", type=float, default=20.0, help="size of the PCD file [million]")
+    parser.add_argument("--repeats", type=int, default=3, help="runs of each case")
+    parser.add_argument("--case", nargs=3, help=argparse.SUPPRESS)
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    GIVEN = options()  # before what is slow to import
+
 import json
 import os
 import subprocess
@@ -22,7 +38,7 @@ import laspy
 import numpy as np
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from streets import drive, long_street
+from street_tiles import drive, long_street
 
 import tilestream as ts
 from tilestream.formats import open_source
@@ -173,26 +189,21 @@ def measure(kind: str, case: str, path: Path, repeats: int) -> dict[str, float]:
     return dict(json.loads(told.stdout))
 
 
-def main() -> None:
+def main(given: argparse.Namespace) -> None:
     """Write the files, measure every case, print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--points", type=float, default=20.0, help="size of the PCD file [million]")
-    parser.add_argument("--repeats", type=int, default=3, help="runs of each case")
-    parser.add_argument("--case", nargs=3, help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
-    if arguments.case:
-        kind, case, path = arguments.case
-        print(json.dumps(run_case(kind, case, Path(path), arguments.repeats)))
+    if given.case:
+        kind, case, path = given.case
+        print(json.dumps(run_case(kind, case, Path(path), given.repeats)))
         return
     print(
         "| file | case | M points/s of CPU | of wall | peak MB | beyond a warm process | x plain |"
     )
     print("|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as scratch:
-        for kind, path in write_files(Path(scratch), arguments.points).items():
+        for kind, path in write_files(Path(scratch), given.points).items():
             plain = 0.0
             for case in [*READS[kind], *LEAVES]:
-                found = measure(kind, case, path, arguments.repeats)
+                found = measure(kind, case, path, given.repeats)
                 plain = plain or found["cpu"]
                 millions = found["points"] / 1e6
                 columns = (
@@ -223,4 +234,4 @@ def measure_base() -> int:
 
 
 if __name__ == "__main__":
-    main()
+    main(GIVEN)

@@ -1,6 +1,6 @@
 """How fast a model is applied: rows per second of one core, by part.
 
-    python benchmarks/predict.py [--rows N] [--json FILE]
+    python benchmarks/predict.py [--rows N] [--share S] [--json FILE]
     python benchmarks/predict.py --run DIR [--json FILE]
 
 Without a run: trains both recipes on synthetic drives as long as the paper's five paths, then times
@@ -15,31 +15,54 @@ Core-seconds (of the process, which has one thread), the smallest of three repea
 """
 
 import argparse
+from pathlib import Path
+
+
+def options() -> argparse.Namespace:
+    """What the command line asks for."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--rows", type=int, default=20_000, help="places to estimate")
+    parser.add_argument("--share", type=float, default=1.0, help="of the paths that are learnt")
+    parser.add_argument("--run", type=Path, metavar="DIR", help="a finished run directory")
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    GIVEN = options()  # before what is slow to import
+
 import json
 import os
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from tempfile import TemporaryDirectory
 
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ[name] = "1"
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
-import numpy as np  # noqa: E402
-import pandas as pd  # noqa: E402
-from forest_data import COLUMNS, dataset, drives  # noqa: E402
-from tilestream.dataflow.estimate_tasks import PredictTask, places_with_factors  # noqa: E402
-from tilestream.dataflow.tasks import perform  # noqa: E402
+import numpy as np
+import pandas as pd
+from forest_data import COLUMNS, LENGTHS, dataset, drives
 
-from tilestream.forest.model_file import load_model, save_model  # noqa: E402
-from tilestream.forest.reasons import contributions  # noqa: E402
-from tilestream.forest.training import predict, train  # noqa: E402
-from tilestream.pipeline.jobs.run_findings import Done, places_of  # noqa: E402
-from tilestream.report import Findings  # noqa: E402
-from tilestream.report.exports import write_geoparquet  # noqa: E402
-from tilestream.tiling import TileKey  # noqa: E402
+from tilestream.forest.model_file import load_model, save_model
+from tilestream.forest.reasons import contributions
+from tilestream.forest.training import predict, train
+from tilestream.pipeline.engine.attempt import perform
+from tilestream.pipeline.engine.outputs import Parquet
+from tilestream.pipeline.engine.stage import Product, Task
+from tilestream.pipeline.jobs.run_findings import Done, places_of
+from tilestream.pipeline.stages import factors as factors_stage
+from tilestream.pipeline.stages import observe as observe_stage
+from tilestream.pipeline.stages import predict as predict_stage
+from tilestream.pipeline.stages.samples import places_with_factors
+from tilestream.pipeline.stages.train import ModelInUse
+from tilestream.report import Findings
+from tilestream.report.exports import write_geoparquet
+from tilestream.tiling import TileKey
 
 REPEATS = 3
 
@@ -54,10 +77,11 @@ def seconds(work: Callable[[], object]) -> float:
     return best
 
 
-def measure(recipe: str, rows: int, file: Path) -> dict[str, float | str]:
-    """Figures of one recipe."""
+def measure(recipe: str, rows: int, share: float, file: Path) -> dict[str, float | str]:
+    """Figures of one recipe, trained on the first part of each path."""
+    lengths = {path: round(share * metres) for path, metres in LENGTHS.items()}
     begin = time.process_time()
-    save_model(train(dataset(0), recipe=recipe), file)
+    save_model(train(dataset(0, lengths=lengths), recipe=recipe), file)
     trained = time.process_time() - begin
     model = load_model(file)
     some = drives(1, {"a": 2000})[0]
@@ -76,22 +100,43 @@ def measure(recipe: str, rows: int, file: Path) -> dict[str, float | str]:
     }
 
 
-def tasks_of(run_dir: Path, out: Path) -> list[PredictTask]:
+def tasks_of(run_dir: Path, out: Path) -> list[Task]:
     """The predict tasks of a finished run, as `plan_estimate` plans them, but written elsewhere."""
-    model = run_dir / "model.skops"
-    made = tuple(load_model(model).made_with.items())
+    model = ModelInUse.of(str(run_dir / "model.skops"))
+    making = dict(model.read().made_with)
     tasks = []
     for factors in sorted((run_dir / "tables" / "factors").glob("*.parquet")):
         x, y = map(int, factors.stem.split("_"))
         around = [f"{x + i}_{y + j}" for i in (-1, 0, 1) for j in (-1, 0, 1)]
         tables = [run_dir / "tables" / "observability" / f"{name}.parquet" for name in around]
-        observed = tuple(str(path) for path in tables if path.exists())
-        points = len(pd.read_parquet(factors, columns=["sample"]))
-        tile, place = TileKey(x, y), str(out / factors.name)
+        observed = tuple(Product(Parquet(str(path)), "", ()) for path in tables if path.exists())
         tasks.append(
-            PredictTask(str(model), "now", str(factors), observed, tile, made, place, "now", points)
+            Task(
+                predict_stage.predict,
+                factors.stem,
+                Parquet(str(out / factors.name)),
+                takes={"making": making, "offset": 0.0},
+                reads={
+                    "model": model,
+                    "factors": Product(Parquet(str(factors)), "", ()),
+                    "observed": observed,
+                },
+                work=len(pd.read_parquet(factors, columns=["sample"])),
+                tile=TileKey(x, y),
+            )
         )
     return tasks
+
+
+def measured(run_dir: Path, tasks: list[Task]) -> Done:
+    """All tasks whose tables the report gathers: those that are applied, and what they read."""
+    folders = ((factors_stage.factors, "factors"), (observe_stage.observe, "observability"))
+    made = [
+        Task(stage, path.stem, Parquet(str(path)))
+        for stage, folder in folders
+        for path in sorted((run_dir / "tables" / folder).glob("*.parquet"))
+    ]
+    return Done((*made, *tasks))
 
 
 def district(run_dir: Path) -> dict[str, float | str]:
@@ -99,24 +144,27 @@ def district(run_dir: Path) -> dict[str, float | str]:
     with TemporaryDirectory() as folder:
         out = Path(folder) / "predictions"
         tasks = tasks_of(run_dir, out)
-        model = load_model(tasks[0].model)
-        perform(tasks[0])  # from here on the process holds the model, as a worker does
+        file = run_dir / "model.skops"
+        model = load_model(file)
+        perform(tasks[0], None)  # from here on the process holds the model, as a worker does
 
-        def again(task: PredictTask) -> None:
-            Path(task.out).unlink(missing_ok=True)
-            perform(task)
+        def again(task: Task) -> None:
+            (out / f"{task.name}.parquet").unlink(missing_ok=True)
+            perform(task, None)
 
-        points = np.array([task.points for task in tasks], np.float64)
+        def read(task: Task) -> pd.DataFrame:
+            what = task.arguments()
+            return places_with_factors([what["factors"]], what["observed"])
+
+        points = np.array([task.work for task in tasks], np.float64)
         spent = np.array([seconds(lambda task=task: again(task)) for task in tasks])
         per_point, per_tile = np.polyfit(points, spent, 1)
-        tables = [places_with_factors([task.factors], task.observed) for task in tasks]
-        done = Done(tuple(task.factors for task in tasks), observed_of(tasks), tuple(tasks), None)
+        tables = [read(task) for task in tasks]
+        done = measured(run_dir, tasks)
         parquet = Path(folder) / "places.parquet"
         gather = seconds(lambda: write_geoparquet(parquet, Findings("all", places_of(done))))
-        load = seconds(lambda: load_model(tasks[0].model))
-        reading = seconds(
-            lambda: [places_with_factors([task.factors], task.observed) for task in tasks]
-        )
+        load = seconds(lambda: load_model(file))
+        reading = seconds(lambda: [read(task) for task in tasks])
         alone = seconds(lambda: [predict(model, table) for table in tables])
         together = pd.concat(tables, ignore_index=True)
         at_once = seconds(lambda: predict(model, together))
@@ -136,26 +184,15 @@ def district(run_dir: Path) -> dict[str, float | str]:
     }
 
 
-def observed_of(tasks: list[PredictTask]) -> tuple[str, ...]:
-    """The tables of observability of all tasks, each once."""
-    return tuple(dict.fromkeys(path for task in tasks for path in task.observed))
-
-
-def main() -> None:
+def main(given: argparse.Namespace) -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--rows", type=int, default=20_000)
-    parser.add_argument("--run", type=Path, metavar="DIR")
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
-    if options.run:
-        found = [district(options.run)]
+    if given.run:
+        found = [district(given.run)]
     else:
         file = Path(os.environ.get("TMPDIR", "/tmp")) / f"predict-{os.getpid()}.skops"
         try:
-            found = [measure(recipe, options.rows, file) for recipe in ("default", "paper")]
+            recipes = ("default", "paper")
+            found = [measure(recipe, given.rows, given.share, file) for recipe in recipes]
         finally:
             file.unlink(missing_ok=True)
     for figures in found:
@@ -165,9 +202,9 @@ def main() -> None:
                 for name, value in figures.items()
             )
         )
-    if options.json:
-        options.json.write_text(json.dumps(found, indent=2))
+    if given.json:
+        given.json.write_text(json.dumps(found, indent=2))
 
 
 if __name__ == "__main__":
-    main()
+    main(GIVEN)

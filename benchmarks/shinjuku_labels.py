@@ -2,33 +2,58 @@
 
     python benchmarks/shinjuku_labels.py [--preset paper] [--out FOLDER] [--every 10] [--workers 1]
     python benchmarks/shinjuku_labels.py --drives 0 1     # the ceiling: two drives of every path
+    python benchmarks/shinjuku_labels.py --against FOLDER # are they those of another run's folder?
     python benchmarks/shinjuku_labels.py --knobs drive    # one phenomenon switched off at a time
     python benchmarks/shinjuku_labels.py --knobs map --paths III
 
 Simulates what is not there yet, makes the map of every street, registers every n-th scan from 317
 starts with the production matcher, and prints the shares of sample points beyond each limit. With
-`--every 1` all 3612 sample points are labelled. `--knobs drive` measures anew
-at the sample points, in the map that is there; `--knobs map` simulates anew for each knob.
+`--every 1` all 3612 sample points are labelled. `--knobs drive` measures anew at the sample points,
+in one map; `--knobs map` simulates anew for each knob. `--size small`: 40 m of each path.
 """
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
+
+
+def options() -> argparse.Namespace:
+    """What the command line asks for."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--preset", default="paper")
+    parser.add_argument("--out", type=Path, default=Path("shinjuku-paper"), help="continues there")
+    parser.add_argument("--every", type=int, default=10, help="label each n-th sample point")
+    parser.add_argument("--drives", type=int, nargs="+", default=[0], help="numbers of the drives")
+    parser.add_argument("--knobs", choices=("drive", "map"), help="switch off those of the drive")
+    parser.add_argument("--paths", nargs="+", help="only these; all by default")
+    parser.add_argument("--size", choices=("full", "small"), default="full")
+    parser.add_argument("--workers", type=int, default=1, help="worker processes")
+    parser.add_argument("--against", type=Path, help="a folder of --out: compare with its labels")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    GIVEN = options()  # before what is slow to import
+
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from tilestream.dataflow.localize_tasks import box_around
+from scipy.stats import ks_2samp
 
 import tilestream as ts
 from tilestream.formats.mcap import ScanSelection
 from tilestream.pipeline.engine.cluster import dask_client
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY
-from tilestream.pipeline.jobs.simulate import simulate
+from tilestream.pipeline.jobs.simulate import SMALL_POINTS, simulate
 from tilestream.records import Float64
 from tilestream.simulation.city import build_city
 from tilestream.simulation.drive import scans
 from tilestream.simulation.settings import SimulationSettings, load_preset
+from tilestream.simulation.streets import Street
+from tilestream.tiling import Box
 
 LIMITS = (0.10, 0.15, 0.20, 0.25)
 PAPER = {
@@ -65,26 +90,22 @@ REACH = 110.0
 
 
 def labels(
-    settings: SimulationSettings,
-    folder: Path,
-    every: int,
-    workers: int,
-    paths: list[str] | None = None,
+    settings: SimulationSettings, folder: Path, given: argparse.Namespace
 ) -> dict[str, pd.Series]:
     """Mean error of the labelled sample points of each path [m], by the number of their scan."""
     found = {}
-    with dask_client(None, workers, DEFAULT_MEMORY) as client:
-        simulate(settings, folder, paths=paths, client=client)
+    with dask_client(None, given.workers, DEFAULT_MEMORY) as client:
+        simulate(settings, folder, paths=given.paths, size=given.size, client=client)
         store = ts.ingest(str(folder / "survey" / "*.laz"), folder / "map.zarr", client=client)
         for log in sorted((folder / "logs" / f"drive{settings.drive}").glob("*.mcap")):
-            if paths is not None and log.stem not in paths:
+            if given.paths is not None and log.stem not in given.paths:
                 continue
             table = ts.localize(
                 store,
                 log,
-                folder / f"labels-{every}" / f"drive{settings.drive}" / log.stem,
+                folder / f"labels-{given.every}" / f"drive{settings.drive}" / log.stem,
                 registration=ts.RegistrationSettings.autoware(),
-                scans=ScanSelection(every=every),
+                scans=ScanSelection(every=given.every),
                 client=client,
             )
             error = table.loc[table["status"] == "done"].set_index("scan")["error_mean"]
@@ -121,6 +142,34 @@ def ceiling(first: dict[str, pd.Series], second: dict[str, pd.Series]) -> str:
     return "\n".join(lines)
 
 
+def against(before: pd.Series, after: pd.Series) -> str:
+    """Markdown: two runs' labels, their distributions and the differences at the same scans."""
+    both = pd.DataFrame({"before": before, "after": after})
+    told = both.describe(percentiles=[0.1, 0.25, 0.5, 0.75, 0.9]).drop("count").mul(100)
+    for limit in LIMITS:
+        told.loc[f"> {100 * limit:.0f} cm"] = 100 * (both > limit).mean()
+    lines = [
+        f"| {len(before)} and {len(after)} labels [cm, %] | before | after |",
+        "|---" * 3 + "|",
+    ]
+    lines += [f"| {row.Index} | {row.before:.2f} | {row.after:.2f} |" for row in told.itertuples()]
+    test = ks_2samp(before, after)
+    change = (both["after"] - both["before"]).dropna()
+    return "\n".join(lines) + (
+        f"\n\ntwo-sample Kolmogorov-Smirnov: D = {test.statistic:.3f}, p = {test.pvalue:.2f}\n"
+        f"paired: {len(change)} scans, {(change == 0).sum()} with the same bits, mean change "
+        f"{1000 * change.mean():.3f} mm, largest {1000 * change.abs().max():.3f} mm"
+    )
+
+
+def labels_in(folder: Path, every: int, drive: int) -> pd.Series:
+    """Mean errors [m] that a run left in its folder, by path and number of the scan."""
+    tables = (folder / f"labels-{every}" / f"drive{drive}").glob("*/errors/*.parquet")
+    table = pd.concat({file.stem: pd.read_parquet(file) for file in tables})
+    done = table[table["status"] == "done"].droplevel(1).set_index("scan", append=True)
+    return done["error_mean"].sort_index()
+
+
 def changed(settings: SimulationSettings, changes: dict[str, dict[str, Any]]) -> SimulationSettings:
     """The settings with some fields of their parts set otherwise."""
     parts = {
@@ -129,15 +178,18 @@ def changed(settings: SimulationSettings, changes: dict[str, dict[str, Any]]) ->
     return settings.model_copy(update=parts)
 
 
-def knobs_of_the_drive(settings: SimulationSettings, folder: Path, every: int) -> None:
+def knobs_of_the_drive(settings: SimulationSettings, given: argparse.Namespace) -> None:
     """Print what the drive's knobs move, at every n-th sample point in the map of the folder."""
-    store = ts.ingest(str(folder / "survey" / "*.laz"), folder / "map.zarr")
+    with dask_client(None, given.workers, DEFAULT_MEMORY) as client:
+        simulate(settings, given.out, paths=given.paths, size=given.size, client=client)
+        survey = str(given.out / "survey" / "*.laz")
+        store = ts.ingest(survey, given.out / "map.zarr", client=client)
     city = build_city(settings, check=False)
     places = [
         (street, point)
         for street in city.streets
-        if street.driven
-        for point in range(every // 2, len(street.xy), every)
+        if street.driven and (given.paths is None or street.name in given.paths)
+        for point in range(given.every // 2, end_of(street, given.size), given.every)
     ]
     maps = [ts.cells_of(_points_around(store, street.xy[point])) for street, point in places]
     matcher = ts.RegistrationSettings.autoware()
@@ -155,25 +207,24 @@ def knobs_of_the_drive(settings: SimulationSettings, folder: Path, every: int) -
         print(row_of(name, found, usual), flush=True)
 
 
+def end_of(street: Street, size: str) -> int:
+    """How many of a street's sample points are simulated."""
+    return len(street.xy) if size == "full" else min(len(street.xy), SMALL_POINTS)
+
+
 def _points_around(store: ts.TileStore, place: Float64) -> Float64:
     """The map points of all tiles within reach of a place."""
     there = set(store.keys())
-    keys = [key for key in store.grid.keys_over(box_around(place[None], REACH)) if key in there]
+    keys = [key for key in store.grid.keys_over(Box.around(place[None], REACH)) if key in there]
     return np.concatenate([store.tile(key).points() for key in keys])
 
 
-def knobs_of_the_map(
-    settings: SimulationSettings,
-    folder: Path,
-    every: int,
-    workers: int,
-    paths: list[str] | None,
-) -> None:
+def knobs_of_the_map(settings: SimulationSettings, given: argparse.Namespace) -> None:
     """Print what the knobs of city and map move, on some paths, simulated anew for each."""
     usual = None
     for name, changes in OF_THE_MAP.items():
-        place = folder / "knobs" / name.replace(",", "").replace(" ", "-")
-        found = pd.concat(labels(changed(settings, changes), place, every, workers, paths))
+        place = given.out / "knobs" / name.replace(",", "").replace(" ", "-")
+        found = pd.concat(labels(changed(settings, changes), place, given))
         usual = found if usual is None else usual
         print(row_of(name, found, usual), flush=True)
 
@@ -186,37 +237,29 @@ def row_of(name: str, error: pd.Series, usual: pd.Series) -> str:
     return "| " + " | ".join([name, str(len(error)), *shares, *centre, moved]) + " |"
 
 
-def main() -> None:
+def main(given: argparse.Namespace) -> None:
     """Simulate, label, print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--preset", default="paper")
-    parser.add_argument("--out", type=Path, default=Path("shinjuku-paper"))
-    parser.add_argument("--every", type=int, default=10)
-    parser.add_argument("--drives", type=int, nargs="+", default=[0])
-    parser.add_argument("--knobs", choices=("drive", "map"))
-    parser.add_argument("--paths", nargs="+", help="only these; all by default")
-    parser.add_argument("--workers", type=int, default=1)
-    given = parser.parse_args()
     settings = load_preset(given.preset)
     if given.knobs is not None:
         print("| switched off | points | > 10 cm | > 15 | > 20 | > 25 | mean | median | moved |")
         print("|---" * 9 + "|", flush=True)
-        if given.knobs == "drive":
-            knobs_of_the_drive(settings, given.out, given.every)
-        else:
-            knobs_of_the_map(settings, given.out, given.every, given.workers, given.paths)
+        knobs = knobs_of_the_drive if given.knobs == "drive" else knobs_of_the_map
+        knobs(settings, given)
         return
     found = [
-        labels(settings.model_copy(update={"drive": drive}), given.out, given.every, given.workers)
+        labels(settings.model_copy(update={"drive": drive}), given.out, given)
         for drive in given.drives
     ]
     for drive, table in zip(given.drives, found, strict=True):
         print(f"drive {drive}, preset {given.preset}:\n\n{table_one(table)}\n")
     for drive, table in zip(given.drives[1:], found[1:], strict=True):
         print(f"drive {drive} from drive {given.drives[0]}:\n\n{ceiling(found[0], table)}\n")
+    if given.against is not None:
+        runs = (
+            labels_in(folder, given.every, given.drives[0]) for folder in (given.against, given.out)
+        )
+        print(against(*runs))
 
 
 if __name__ == "__main__":
-    main()
+    main(GIVEN)

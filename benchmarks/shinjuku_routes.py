@@ -1,12 +1,28 @@
-"""Lay the routes of the simulated Shinjuku through its streets; writes the package's route file.
+"""Lay the routes of the simulated Shinjuku through its streets.
 
-    python benchmarks/shinjuku_routes.py
+    python benchmarks/shinjuku_routes.py ROUTES.geojson
 
-The waypoints are ours; the ways between them keep clear of the real buildings.
+The package's own file is tilestream/data/shinjuku_routes.geojson. The waypoints are ours; the ways
+between them keep clear of the real buildings.
 """
 
-import json
+import argparse
 from pathlib import Path
+
+
+def options() -> argparse.Namespace:
+    """What the command line asks for."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("routes", type=Path, help="the file to write")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    GIVEN = options()  # before what is slow to import
+
+import json
 
 import numpy as np
 
@@ -123,7 +139,7 @@ SPOTS = {
 NAMES = ("kind", "begin", "end", "side")
 
 
-def main() -> None:
+def main(given: argparse.Namespace) -> None:
     """Lay all routes, check their clearance exactly, and write them."""
     buildings = read_footprints(DATA / "shinjuku_buildings.geojson.gz")
     space = free_space(buildings)
@@ -138,8 +154,8 @@ def main() -> None:
         geometry = {"type": "LineString", "coordinates": xy.tolist()}
         features.append({"type": "Feature", "properties": properties, "geometry": geometry})
     document = {"type": "FeatureCollection", "name": "shinjuku routes", "features": features}
-    (DATA / "shinjuku_routes.geojson").write_text(json.dumps(document) + "\n")
+    given.routes.write_text(json.dumps(document) + "\n")
 
 
 if __name__ == "__main__":
-    main()
+    main(GIVEN)

@@ -1,6 +1,6 @@
 """What the virtual drive costs, and how well it says where a real one errs.
 
-    python benchmarks/virtual_drive.py cost [--tiles 1,4,9]
+    python benchmarks/virtual_drive.py cost [--tiles 1 4 9]
     python benchmarks/virtual_drive.py city RUN [--every 10] [--set without_ghosts=false]
     python benchmarks/virtual_drive.py sensors RUN [--set ...]
 
@@ -14,19 +14,41 @@ RUN.
 """
 
 import argparse
+from pathlib import Path
+
+
+def options() -> argparse.Namespace:
+    """What the command line asks for."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parts = parser.add_subparsers(dest="part", required=True)
+    cost_of = parts.add_parser("cost", help="of the virtual drive, by step")
+    cost_of.add_argument("--tiles", type=int, nargs="+", default=[1, 4, 9], help="sizes of a city")
+    cost_of.add_argument("--spacing", type=float, default=0.13, help="of the surfaces [m]")
+    city_of = parts.add_parser("city", help="against the errors of a simulated city")
+    city_of.add_argument("--every", type=int, default=10, help="use each n-th sample point")
+    for part in (city_of, parts.add_parser("sensors", help="over the lidars of a real drive")):
+        part.add_argument("run", type=Path, help="a finished run directory")
+        part.add_argument("--set", action="append", default=[], help="of the virtual drive")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    GIVEN = options()  # before what is slow to import
+
 import itertools
 import tempfile
 import time
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import yaml
 from scipy.stats import spearmanr
-from streets import TILE, Floats, long_street
+from street_tiles import TILE, Floats, long_street
 
 import tilestream as ts
 from tilestream.factors.ghosts import ghosts_among
@@ -82,17 +104,17 @@ def show(title: str, rows: pd.DataFrame) -> None:
 # --- 1. Cost
 
 
-def street(folder: Path, tiles: int) -> ts.TileStore:
-    """A street of that many tiles of a million points."""
+def street(folder: Path, tiles: int, spacing: float) -> ts.TileStore:
+    """A street of that many tiles; its surfaces at 0.13 m, of a million points each."""
     folder.mkdir(parents=True)
-    for number, points in enumerate(long_street(tiles, 0, 0.13)):
+    for number, points in enumerate(long_street(tiles, 0, spacing)):
         write_pcd(folder / f"{number:03}.pcd", points)
     return ts.ingest([folder / "*.pcd"], folder / "map.zarr", tile_size=TILE)
 
 
-def cost(folder: Path) -> pd.DataFrame:
+def cost(folder: Path, spacing: float) -> pd.DataFrame:
     """What each step costs at a sample point in the middle of three tiles."""
-    store = street(folder, 3)
+    store = street(folder, 3, spacing)
     places = np.array([[1.5 * TILE + x, TILE / 2 + 0.5, 2.08] for x in range(-12, 13)])
     place_mm, heading, seeing = whole_places(places[12]), 0.1, VirtualSettings()
     key, edge_mm = store.grid.key_at(*places[12, :2]), surfel_mm(store)
@@ -141,11 +163,11 @@ def upright(place_mm: Any, heading: float) -> Floats:
     return T_map_lidar
 
 
-def cost_of_cities(folder: Path, sizes: list[int]) -> pd.DataFrame:
+def cost_of_cities(folder: Path, sizes: list[int], spacing: float) -> pd.DataFrame:
     """What a tile costs in larger and larger cities, everything together."""
     rows = []
     for tiles in sizes:
-        store = street(folder / str(tiles), tiles)
+        store = street(folder / str(tiles), tiles, spacing)
         ends = np.array([[0.5, TILE / 2 + 0.5, 0.08], [tiles * TILE - 0.5, TILE / 2 + 0.5, 0.08]])
         route = route_of("street", ends)
         began = time.process_time()
@@ -331,28 +353,23 @@ def sensors(run: Path, changes: dict[str, Any]) -> None:
     )
 
 
-def main() -> None:
+def changed(settings: list[str]) -> dict[str, Any]:
+    """Settings of the virtual drive, from `key=value`."""
+    return {key: yaml.safe_load(value) for key, value in (s.split("=", 1) for s in settings)}
+
+
+def main(given: argparse.Namespace) -> None:
     """Measure what is asked for."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("part", choices=["cost", "city", "sensors"])
-    parser.add_argument("run", type=Path, nargs="?", help="a finished run directory")
-    parser.add_argument("--tiles", default="1,4,9")
-    parser.add_argument("--every", type=int, default=10)
-    parser.add_argument("--set", action="append", default=[], help="a setting of the virtual drive")
-    given = parser.parse_args()
-    changes = {key: yaml.safe_load(value) for key, value in (s.split("=", 1) for s in given.set)}
-    if given.part != "cost" and given.run is None:
-        parser.error("give a finished run directory")
     if given.part == "city":
-        city(given.run, given.every, changes)
+        city(given.run, given.every, changed(given.set))
     elif given.part == "sensors":
-        sensors(given.run, changes)
+        sensors(given.run, changed(given.set))
     else:
         with tempfile.TemporaryDirectory() as scratch:
-            show("Per sample point", cost(Path(scratch) / "street"))
-            sizes = [int(size) for size in given.tiles.split(",")]
-            show("Per tile", cost_of_cities(Path(scratch) / "city", sizes))
+            show("Per sample point", cost(Path(scratch) / "street", given.spacing))
+            cities = cost_of_cities(Path(scratch) / "city", given.tiles, given.spacing)
+            show("Per tile", cities)
 
 
 if __name__ == "__main__":
-    main()
+    main(GIVEN)

@@ -5,7 +5,6 @@ import os
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
+from patience import PATIENCE, wait_until
 
 # A busy machine is slow, which is no fault of the code: no test is timed.
 settings.register_profile("calm", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -43,6 +43,18 @@ LONG = (
 )
 """Files of ten seconds and more, the longest first: what is begun last must be short, or one of
 the processes that the tests run in would wait for another."""
+
+LONGEST = 6
+"""So many of these files take half of the time: `--fast-half` leaves them out."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--fast-half", action="store_true", help="without the longest files")
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    name = collection_path.stem.removeprefix("test_")
+    return True if config.getoption("fast_half") and name in LONG[:LONGEST] else None
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -96,8 +108,13 @@ def _workers() -> Iterator[Any]:
 @pytest.fixture
 def workers(_workers: Any) -> Any:
     """A client of two worker processes of our own, which all tests of a session share."""
-    _workers.wait_for_workers(2, timeout=60)  # a test before may have killed one
+    _workers.wait_for_workers(2, timeout=PATIENCE)  # a test before may have killed one
     return _workers
+
+
+def listens(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
 @pytest.fixture
@@ -122,13 +139,7 @@ def s3_bucket(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
         stderr=subprocess.DEVNULL,
     )
     try:
-        until = time.monotonic() + 30.0
-        while True:
-            with socket.socket() as probe:
-                if probe.connect_ex(("127.0.0.1", port)) == 0:
-                    break
-            assert time.monotonic() < until, "no S3 server within 30 s"
-            time.sleep(0.1)
+        wait_until(lambda: listens(port), "the S3 server listens")
         s3fs.S3FileSystem.clear_instance_cache()
         s3fs.S3FileSystem().mkdir("bucket")
         yield "s3://bucket"

@@ -13,13 +13,13 @@ import psutil
 import pytest
 from city_tiles import digest, run_city, write_city, write_drive
 from elsewhere import scheduler_elsewhere
+from patience import PATIENCE
 
 N, SIZE = 3, 20.0
 WORKERS = 2
 KILLS = {"worker": 13, "client": 4, "machine": 3}
 """A worker is replaced by its nanny; a client is started again; a machine takes client, scheduler
 and workers with it, and all are started again."""
-PATIENCE = 900.0
 
 CLIENT = """
 import sys

@@ -19,6 +19,7 @@ from elsewhere import scheduler_elsewhere
 from hypothesis import given
 from hypothesis import strategies as st
 from naps import Nap
+from patience import wait_until
 from PIL import Image
 
 from tilestream.pipeline.engine.cluster import dask_client
@@ -137,9 +138,9 @@ def test_the_state_of_a_hundred_thousand_tasks_is_small() -> None:
             [f"terms-ts0abcde-{i}_0", 0, 1, i % 300, i // 300] for i in range(first, first + 500)
         ]
         progress.plan([["terms", 1]], lines)
-    began = time.perf_counter()
+    began = time.process_time()
     progress.learn([[f"terms-ts0abcde-{i}_0", DONE, "", ""] for i in range(100_000)])
-    assert time.perf_counter() - began < 3.0
+    assert time.process_time() - began < 3.0  # 0.2 s; with a look at all tasks for each, minutes
     assert progress.stages[0].counts == [0, 0, 100_000, 0, 0]
     assert not progress._open
 
@@ -236,7 +237,7 @@ def test_a_browser_sees_tiles_change(new_workers: distributed.Client, tmp_path: 
     run = threading.Thread(target=execute, args=(tasks, new_workers, None))
     with chromium_page() as page:
         run.start()
-        wait_for_route(f"{url}.json")
+        wait_until(lambda: answers(f"{url}.json"), "the dashboard answers")
         page.goto(url)
         page.wait_for(READY)
         first = page.evaluate(f"[...{TILES}.fill]")
@@ -265,16 +266,12 @@ def test_a_browser_sees_tiles_change(new_workers: distributed.Client, tmp_path: 
     assert grey[0] > grey[1] > grey[2]
 
 
-def wait_for_route(url: str) -> None:
-    until = time.monotonic() + 20.0
-    while True:
-        try:
-            get_json(url)
-        except urllib.error.HTTPError:
-            assert time.monotonic() < until
-            time.sleep(0.1)
-        else:
-            return
+def answers(url: str) -> bool:
+    try:
+        get_json(url)
+    except urllib.error.HTTPError:
+        return False
+    return True
 
 
 def coloured(picture: Path, colour: str) -> int:

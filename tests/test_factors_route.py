@@ -20,6 +20,7 @@ from tilestream.formats.pcd import write_pcd
 from tilestream.formats.routes import resample, route_of, write_geojson_route
 from tilestream.marks import Mark
 from tilestream.pipeline.engine.attempt import Outcome
+from tilestream.pipeline.jobs.run_folder import map_of
 from tilestream.store import POINTS, Tile
 from tilestream.tiling import TileGrid
 
@@ -62,6 +63,11 @@ def test_rows_follow_the_route_and_say_what_the_factors_of_their_places_are(
     assert (table["status"] == "done").all()
     direct = ts.factors(store, points.positions, sensor=SENSOR, which="all")
     pd.testing.assert_frame_equal(table[direct.columns.tolist()], direct, check_dtype=False)
+
+
+def test_the_tables_name_their_map(store: ts.TileStore, table: pd.DataFrame, street: Path) -> None:
+    assert len(table)
+    assert map_of(street.parent / "out").address == store.address
 
 
 def winding(name: str, seed: int) -> ts.Route:

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 import distributed
@@ -15,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from killed import killed_after
 
 import tilestream as ts
 from tilestream.config import IngestSettings
@@ -203,26 +203,16 @@ def test_a_killed_worker_is_made_up_for(
     assert tree_digest(url) == tree_digest(reference.url)
 
 
-@pytest.mark.parametrize("tiles_before_the_kill", [pytest.param(0, marks=pytest.mark.slow), 5])
+@pytest.mark.parametrize(
+    ("stage", "tasks"), [pytest.param("scatter", 1, marks=pytest.mark.slow), ("merge", 5)]
+)
 def test_a_killed_ingest_continues_to_the_same_bytes(
-    clouds: list[Path], tmp_path: Path, tiles_before_the_kill: int
+    clouds: list[Path], tmp_path: Path, stage: str, tasks: int
 ) -> None:
     whole, broken = tmp_path / "whole.zarr", tmp_path / "broken.zarr"
     ts.ingest(clouds, whole, tile_size=6.0, map_leaf=0.1)
-    arguments = [*map(str, clouds), "--tile-size", "6", "--map-leaf", "0.1", "--store", str(broken)]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "tilestream", "ingest", *arguments],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    pattern = "fragments/*" if not tiles_before_the_kill else f"*/{POINTS}/zarr.json"
-    end = time.monotonic() + 60.0
-    while len(list(broken.glob(pattern))) <= tiles_before_the_kill:
-        assert time.monotonic() < end
-        assert process.poll() is None, "it ended before it could be killed"
-        time.sleep(0.002)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+    call = "ts.ingest(sys.argv[2:], sys.argv[1], tile_size=6.0, map_leaf=0.1, watch=watch)"
+    killed_after(tasks, stage, call, str(broken), *map(str, clouds))
     assert (broken / "fragments").exists()
     assert tree_digest(broken) != tree_digest(whole)
     ts.ingest(clouds, broken, tile_size=6.0, map_leaf=0.1)

@@ -2,6 +2,8 @@
 
 The alignment is chaotic: of two runs that start a micrometre apart 6-8 % end more than 1 mm from
 each other. So poses are compared as shares, and only what happens at a given pose to tight bounds.
+The limits of shares are four and more standard errors away: those over runs whose starts differ by
+0.1 micrometres, which is more than the arithmetic of another processor does to them.
 """
 
 from pathlib import Path
@@ -65,13 +67,13 @@ def test_autoware_preset_scores_autowares_poses_as_autoware_does(golden: Golden)
 def test_autoware_preset_ends_where_autoware_ends(
     golden: Golden, as_autoware: Registrations
 ) -> None:
-    assert (as_autoware.iterations == golden.iterations).mean() >= 0.97
+    assert (as_autoware.iterations == golden.iterations).mean() > 0.967  # 0.979, error 0.0024
     apart = np.linalg.norm(as_autoware.T_map_lidar[:, :3, 3] - golden.T_autoware[:, :3, 3], axis=1)
-    assert (apart < 1e-3).mean() >= 0.87
+    assert (apart < 1e-3).mean() > 0.87  # 0.889, error 0.004
     ours, theirs = golden.error(as_autoware.T_map_lidar), golden.error(golden.T_autoware)
     assert (theirs < 0.1).mean() == pytest.approx(0.729, abs=0.001)
-    assert (ours < 0.1).mean() == pytest.approx(0.729, abs=0.02)
-    assert ours.mean() == pytest.approx(theirs.mean(), rel=0.05)
+    assert (ours < 0.1).mean() == pytest.approx(0.729, abs=0.02)  # 0.728, error 0.001
+    assert ours.mean() == pytest.approx(theirs.mean(), rel=0.05)  # 0.994 of it, error 0.007
 
 
 @pytest.mark.parametrize(("neighbours", "median"), [("direct7", 0.0115), ("direct1", 0.009)])
@@ -80,8 +82,8 @@ def test_definite_solver_is_accurate_from_all_starts(
 ) -> None:
     how = RegistrationSettings(neighbours=neighbours)
     error = golden.error(register(golden.cells, golden.scan, golden.starts, how).T_map_lidar)
-    assert np.median(error) <= median
-    assert (error < 0.1).mean() >= 0.97
+    assert np.median(error) < median  # 0.0107 and 0.0075, errors below 0.00001
+    assert (error < 0.1).mean() > 0.96  # 0.984 and 0.997, errors 0.005 and 0.0025
 
 
 def binary_pcd(path: Path) -> Floats:

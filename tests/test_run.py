@@ -22,6 +22,7 @@ from elsewhere import certificates, scheduler_elsewhere
 from hypothesis import given
 from hypothesis import strategies as st
 from naps import MEMORY, ORDER, After, Nap, Sum
+from patience import wait_until
 
 from tilestream.errors import PlanError, TaskError, UsageError
 from tilestream.pipeline.engine.attempt import Outcome
@@ -265,10 +266,7 @@ def test_each_stage_is_one_span_and_keys_name_stage_and_tile(workers: distribute
             keys.append(key)
 
     scheduler = workers.cluster.scheduler
-    until = time.monotonic() + 30.0
-    while scheduler.tasks:  # those of the test before are still being forgotten
-        assert time.monotonic() < until
-        time.sleep(0.01)
+    wait_until(lambda: not scheduler.tasks, "the tasks of the test before are forgotten")
     scheduler.add_plugin(Keys(), name="keys")
     before = set(scheduler.extensions["spans"].spans)
     naps = [Nap(TileKey(i, -1), stage) for stage in ("spa", "spb") for i in range(9)]
@@ -395,10 +393,7 @@ def test_a_run_waits_for_what_a_killed_client_left_behind(
     notes.mkdir()
     script.write_text(KILLED.format(tests=str(Path(__file__).parent)))
     first = subprocess.Popen([sys.executable, script, address, tmp_path / "notes"])
-    until = time.monotonic() + 60.0
-    while not list(notes.glob("nap-*")):
-        assert time.monotonic() < until
-        time.sleep(0.05)
+    wait_until(lambda: list(notes.glob("nap-*")), "the first client's task runs")
     first.kill()
     first.wait()
     began = time.time_ns()

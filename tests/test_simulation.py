@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from tilestream.sensors import VLP16
 from tilestream.simulation.footprints import Footprints, read_footprints
 from tilestream.simulation.lidar import measure, turn_of
 from tilestream.simulation.mesh import Material, boxes, joined, walls
-from tilestream.simulation.raycast import Scene
+from tilestream.simulation.raycast import Embree, Open3D, Scene
 from tilestream.simulation.settings import LidarSettings, load_preset, stream
 from tilestream.simulation.streets import (
     MIN_CLEARANCE,
@@ -114,6 +115,39 @@ def test_nothing_to_hit_is_infinitely_far() -> None:
     assert ranges[0] == np.inf
     empty = Scene(joined([]), UTM)
     assert empty.first_hits(UTM[None], np.array([[1.0, 0.0, 0.0]]))[0][0] == np.inf
+
+
+def test_both_casters_meet_the_same_triangles() -> None:
+    for name in ("embreex", "open3d"):
+        reason = f"{name} cannot be loaded, so that there is no second caster"
+        pytest.importorskip(name, reason=reason, exc_type=ImportError)
+    rng = np.random.default_rng(2)
+    corners = rng.uniform(-60.0, 60.0, (5000, 1, 3)) + rng.normal(0.0, 1.5, (5000, 3, 3))
+    start, direction = rng.uniform(-5.0, 5.0, (20_000, 3)), rng.normal(size=(20_000, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    rays = start.astype(np.float32), direction.astype(np.float32)
+    (reach, number, normal), (others_reach, others_number, others_normal) = (
+        caster(corners.astype(np.float32)).cast(*rays) for caster in (Embree, Open3D)
+    )
+    met = number >= 0
+    assert 2_000 < met.sum() < 18_000
+    # Two of 5000 triangles so near each other that rounding decides are met by one ray in 10^5.
+    assert (number != others_number).sum() <= 2
+    met &= number == others_number
+    # Ten units in the last place of a coordinate of 100 m.
+    np.testing.assert_allclose(reach[met], others_reach[met], atol=1e-4, rtol=0.0)
+    ours, others = (
+        found[met] / np.linalg.norm(found[met], axis=1, keepdims=True)
+        for found in (normal, others_normal)
+    )
+    np.testing.assert_allclose(np.abs((ours * others).sum(axis=1)), 1.0, atol=1e-5)
+
+
+def test_what_is_missing_is_said_where_nothing_casts_rays(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("embreex", "embreex.mesh_construction", "open3d"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(UsageError, match=r"embreex.*open3d.*pip install embreex"):
+        wall_ahead(30.0)
 
 
 # --- The sensor

@@ -1,13 +1,8 @@
 """A simulation of a tiny city from settings to logs: sameness, resuming, refusals, reading back."""
 
 import json
-import os
 import re
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from collections import namedtuple
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +12,7 @@ import distributed
 import numpy as np
 import pytest
 import yaml
+from killed import killed_after
 
 import tilestream as ts
 from tilestream.cli import run
@@ -41,6 +37,12 @@ from tilestream.simulation.survey import survey
 A, B = 70, 30
 """Sample points of the driven street and of the one that is only mapped."""
 RECORDS = ("simulation.yaml", "routes.geojson")
+SIMULATE = (
+    "import sys; from tilestream.pipeline.jobs.simulate import simulate; "
+    "from tilestream.simulation.settings import SimulationSettings; "
+    "simulate(SimulationSettings.model_validate_json(sys.argv[1]), sys.argv[2])"
+)
+"""Simulates the settings of the first argument into the folder of the second."""
 
 
 def block(x: float, y: float, width: float, depth: float, height: float) -> dict[str, Any]:
@@ -132,22 +134,27 @@ def test_a_killed_run_goes_on_to_the_same_bytes(
     settings: SimulationSettings, made: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "killed"
-    code = (
-        "import sys; from tilestream.pipeline.jobs.simulate import simulate; "
+    call = (
+        "from tilestream.pipeline.jobs.simulate import simulate; "
         "from tilestream.simulation.settings import SimulationSettings; "
-        "simulate(SimulationSettings.model_validate_json(sys.argv[1]), sys.argv[2])"
+        "settings = SimulationSettings.model_validate_json(sys.argv[1]); "
+        "simulate(settings, sys.argv[2], watch=watch)"
     )
-    child = subprocess.Popen([sys.executable, "-c", code, settings.model_dump_json(), str(out)])
-    deadline = time.monotonic() + 120
-    while not list(out.glob("parts/*.npz")) and child.poll() is None:
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
-    os.kill(child.pid, signal.SIGKILL)
-    assert child.wait() == -signal.SIGKILL
+    killed_after(1, "scan", call, settings.model_dump_json(), str(out))
     before = files(out)
     assert before.keys() != files(made).keys()
     simulate(settings, out)
     assert files(out) == files(made)
+
+
+def test_where_open3d_cannot_be_imported_the_same_bytes_are_written(
+    settings: SimulationSettings, made: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("embreex", reason="no wheel of embreex here: Open3D casts the rays")
+    code = f"import sys; sys.modules['open3d'] = None; {SIMULATE}"
+    arguments = (settings.model_dump_json(), str(tmp_path / "sim"))
+    subprocess.run([sys.executable, "-c", code, *arguments], check=True)
+    assert files(tmp_path / "sim") == files(made)
 
 
 def test_another_drive_adds_its_log_and_leaves_the_rest(

@@ -43,17 +43,20 @@ from tilestream.tiling import TileKey as TileKey
 from tilestream.version import VERSION
 
 if TYPE_CHECKING:
+    from tilestream.apps.view import view as view
     from tilestream.pipeline.jobs.run import dataset as dataset
     from tilestream.pipeline.jobs.run import run as run
     from tilestream.pipeline.jobs.run_settings import RunSettings as RunSettings
 
 
 def __getattr__(name: str) -> Any:
-    """The main job, when it is asked for: what it needs (scikit-learn, Bokeh, matplotlib) would
-    cost every worker process 100 MB that its tiles have a use for.
+    """The main job and the view, when they are asked for: what they need (scikit-learn, Bokeh,
+    matplotlib) would cost every worker process 100 MB that its tiles have a use for.
     """
     if name in ("run", "dataset"):
         return getattr(import_module("tilestream.pipeline.jobs.run"), name)
+    if name == "view":
+        return import_module("tilestream.apps.view").view
     if name == "RunSettings":
         return import_module("tilestream.pipeline.jobs.run_settings").RunSettings
     raise AttributeError(f"module 'tilestream' has no attribute {name!r}")

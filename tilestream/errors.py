@@ -69,6 +69,10 @@ class PlanError(TilestreamError):
     """A job that does not fit what it was promised (memory, disk); says what to change."""
 
 
+class DisplayError(TilestreamError, RuntimeError):
+    """A view that cannot be shown here: no display, or a library is missing; says which."""
+
+
 class LimitError(TilestreamError):
     """The job is done, and an estimate is above the limit that was given."""
 

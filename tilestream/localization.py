@@ -16,6 +16,7 @@ from tilestream.config import RegistrationSettings, StartSettings
 from tilestream.errors import RegistrationError, UsageError
 from tilestream.kernels.anchors import neighbour_lists
 from tilestream.kernels.density import magnusson_constants
+from tilestream.kernels.fixed_order import norms
 from tilestream.kernels.registration import Aligned, LocalMap, Rule, align
 from tilestream.kernels.slots import empty_slots
 from tilestream.records import Cells, Float64, Int64, LocalizationError, Registrations, TruePose
@@ -184,7 +185,7 @@ def localization_error(
     T_map_lidar_starts = _starts(T_map_true, starts, start_settings)
     found = register(cells, scan_points, T_map_lidar_starts, settings)
     errors = start_errors(T_map_true, found.T_map_lidar)
-    distance = np.linalg.norm(T_map_lidar_starts[:, :3, 3] - T_map_true[:3, 3], axis=1)
+    distance = norms(T_map_lidar_starts[:, :3, 3] - T_map_true[:3, 3])
     return LocalizationError(
         T_map_lidar=T_map_true,
         true_pose=true_pose,
@@ -207,15 +208,15 @@ def start_errors(T_map_true: Float64, T_map_final: Float64) -> dict[str, Any]:
         fields of `LocalizationError` say.
     """
     heading = math.atan2(T_map_true[1, 0], T_map_true[0, 0])
-    forward = np.array([math.cos(heading), math.sin(heading)])
+    c, s = math.cos(heading), math.sin(heading)
     offset = T_map_final[:, :3, 3] - T_map_true[:3, 3]
     turned = np.arctan2(T_map_final[:, 1, 0], T_map_final[:, 0, 0]) - heading
     return {
-        "along": offset[:, :2] @ forward,
-        "across": offset[:, 1] * forward[0] - offset[:, 0] * forward[1],
+        "along": offset[:, 0] * c + offset[:, 1] * s,
+        "across": offset[:, 1] * c - offset[:, 0] * s,
         "up": offset[:, 2],
         "yaw": (turned + np.pi) % (2.0 * np.pi) - np.pi,
-        "error": np.sqrt((offset**2).sum(axis=1)),
+        "error": norms(offset),
     }
 
 
@@ -304,7 +305,7 @@ def _scan(scan_points: ArrayLike) -> Float64:
             f"{broken.sum()} of {len(points)} scan points are not finite, "
             f"the first at row {np.argmax(broken)}: leave them out"
         )
-    reach = float(np.linalg.norm(points, axis=1).max())
+    reach = float(norms(points).max())
     if reach > LARGEST_SCAN:
         raise RegistrationError(
             f"a scan point lies {reach:.0f} m from the lidar: give points in the lidar frame"
@@ -416,7 +417,7 @@ def _near(
 ) -> NDArray[np.intp]:
     """Rows of the cells in the box that the scan can reach: its radius and the longest way."""
     steps = settings.iterations_max * max(settings.step_max, settings.epsilon)
-    way = float(np.linalg.norm(points, axis=1).max()) + steps + 2.0 * cells.cell_size
+    way = float(norms(points).max()) + steps + 2.0 * cells.cell_size
     where = starts[:, :3, 3]
     low = np.floor((where.min(axis=0) - way) / cells.cell_size)
     high = np.floor((where.max(axis=0) + way) / cells.cell_size)

@@ -16,6 +16,7 @@ import json
 from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Self
 
 import fsspec
@@ -287,6 +288,11 @@ class TileStore:
     def root(self) -> str:
         """The store's path on that filesystem."""
         return self._place[1]
+
+    @property
+    def address(self) -> str:
+        """The store's URL; of a local store its absolute path, for readers started elsewhere."""
+        return self.url if "://" in self.url else str(Path(self.url).absolute())
 
     @cached_property
     def _zarr(self) -> Any:

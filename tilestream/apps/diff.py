@@ -2,15 +2,13 @@
 
 import os
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 from scipy.spatial import cKDTree
 
 from tilestream.errors import UsageError
-from tilestream.store import TileStore, open_store
-from tilestream.tables import read_tables
+from tilestream.pipeline.jobs.run_folder import map_of, rows_of
 from tilestream.tiling import TileKey
 
 SAME_PLACE = 0.5
@@ -52,7 +50,7 @@ def diff(
         StoreNotFoundError: nothing there.
         UsageError: tiles of different size, which cannot be compared.
     """
-    before, after = _store(old), _store(new)
+    before, after = map_of(old), map_of(new)
     if before.settings.tile_size != after.settings.tile_size:
         raise UsageError(
             f"{before.url} has tiles of {before.settings.tile_size:g} m and {after.url} of "
@@ -71,17 +69,11 @@ def diff(
     )
 
 
-def _store(place: str | os.PathLike[str]) -> TileStore:
-    inside = Path(place) / "map.zarr"
-    return open_store(str(inside) if inside.is_dir() else os.fspath(place))
-
-
 def _estimates(place: str | os.PathLike[str]) -> pd.DataFrame | None:
     """The estimates of a run directory; None where there are none."""
-    paths = sorted((Path(place) / "tables" / "predictions").glob("*.parquet"))
-    if not paths:
+    rows = rows_of(place, "predictions")
+    if rows is None:
         return None
-    rows = read_tables([str(path) for path in paths])
     kept: pd.DataFrame = rows[rows["status"] == "done"].reset_index(drop=True)
     return kept
 

@@ -58,6 +58,10 @@ COMMANDS = {
         "maps",
         "What a map update changes: tiles, and sample points whose estimate got worse.",
     ),
+    "view": (
+        "viewing",
+        "Show a map in 3D, the route on it coloured by measured or estimated error.",
+    ),
     "demo": (
         "jobs",
         "The main job on a few streets of Shinjuku, simulated first: needs minutes and no files.",

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tilestream.factors.vicinity import Sums, Terms, ratio
 from tilestream.kernels.density import magnusson_constants
+from tilestream.kernels.fixed_order import row_sums
 from tilestream.kernels.nearest import group_by_cell
 from tilestream.kernels.neighbours import cells_around, neighbours_within
 from tilestream.kernels.pairs import (
@@ -180,9 +181,9 @@ def factors(sums: Sums) -> dict[str, Float64]:
 
 def entropy(weights: NDArray[np.float64]) -> Float64:
     """Entropy of each row of weights [bit], normalised to sum 1; NaN where all are 0."""
-    share = ratio(weights, weights.sum(axis=1, keepdims=True))
+    share = ratio(weights, row_sums(weights)[:, None])
     log = np.log2(share, out=np.zeros_like(share), where=share > 0)
-    bits: Float64 = np.maximum(-(share * log).sum(axis=1), 0.0)
+    bits: Float64 = np.maximum(-row_sums(share * log), 0.0)
     return bits
 
 
@@ -190,7 +191,7 @@ def _softmax(mean_score: Float64) -> Float64:
     """P(v) ~ exp(s(v) / temperature), each row of sum 1."""
     highest = mean_score.max(axis=1, keepdims=True)
     weight = np.exp((mean_score - highest) / TEMPERATURE)
-    soft: Float64 = weight / weight.sum(axis=1, keepdims=True)
+    soft: Float64 = weight / row_sums(weight)[:, None]
     return soft
 
 
@@ -212,9 +213,8 @@ def curvatures(mean_score: Float64) -> tuple[Float64, Float64]:
     inner = np.maximum(np.abs(x), np.abs(y)) <= (FIT + 0.5) * STEP
     x, y = x[inner], y[inner]
     design = np.column_stack([np.ones_like(x), x, y, x * x / 2, x * y, y * y / 2])
-    # Sums row by row, not a matrix product, whose bits would depend on the number of rows.
     weights = np.linalg.pinv(design)[3:]
-    xx, xy, yy = (-(mean_score[:, inner] * w).sum(axis=1) for w in weights)
+    xx, xy, yy = (-row_sums(mean_score[:, inner] * w) for w in weights)
     middle, radius = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
     return middle - radius, middle + radius
 
@@ -226,9 +226,9 @@ def covariances(soft: Float64) -> tuple[Float64, Float64, Float64]:
         soft: (k, 441) P(v), rows of sum 1.
     """
     x, y = _shifts()
-    dx = x - (soft * x).sum(axis=1, keepdims=True)
-    dy = y - (soft * y).sum(axis=1, keepdims=True)
-    return (soft * dx * dx).sum(axis=1), (soft * dx * dy).sum(axis=1), (soft * dy * dy).sum(axis=1)
+    dx = x - row_sums(soft * x)[:, None]
+    dy = y - row_sums(soft * y)[:, None]
+    return row_sums(soft * dx * dx), row_sums(soft * dx * dy), row_sums(soft * dy * dy)
 
 
 def secondary_peaks(soft: Float64) -> Float64:

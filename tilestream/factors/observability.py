@@ -29,6 +29,7 @@ from tilestream.factors.virtual_scan import (
     first_returns,
     virtual_scan,
 )
+from tilestream.formats.poses import transform
 from tilestream.kernels.cells import cell_of_points, cell_sums
 from tilestream.localization import register
 from tilestream.records import Cells, Column, Float64, Int64
@@ -265,8 +266,7 @@ def hessian_factors(
     Raises:
         RegistrationError: as `register`.
     """
-    in_map = points @ T_map_lidar[:3, :3].T + T_map_lidar[:3, 3]
-    voxels = _distinct(np.floor(in_map / cells.cell_size).astype(np.int64))
+    voxels = _distinct(np.floor(transform(T_map_lidar, points) / cells.cell_size).astype(np.int64))
     still = registration.model_copy(update={"iterations_max": 0})
     near = _within_reach(cells, voxels)
     found = register(near if len(near) else cells, points, T_map_lidar, still)

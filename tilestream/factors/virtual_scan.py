@@ -9,6 +9,7 @@ from pydantic import Field
 
 from tilestream.config import Settings
 from tilestream.factors.surfels import Surfels
+from tilestream.kernels.fixed_order import turned
 from tilestream.kernels.surfels import NORMAL_ONE
 from tilestream.kernels.virtual_scan import (
     BRICK,
@@ -204,7 +205,7 @@ def first_returns(
     """
     c, s = np.cos(heading), np.sin(heading)
     R_map_lidar = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    direction = beams.direction @ R_map_lidar.T
+    direction = turned(R_map_lidar, beams.direction)
     ranges, cosine = np.empty(len(direction)), np.empty(len(direction))
     near, reach = seeing.range_min * MM_PER_M, beams.range_max * MM_PER_M
     cast(scene.bricks, place_mm, direction, near, reach, ranges, cosine)

@@ -15,6 +15,7 @@ from sklearn.neural_network import MLPRegressor
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVR
+from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from tilestream.errors import ModelError
 from tilestream.forest.dataset import Dataset
@@ -184,11 +185,12 @@ def _regression(make: Callable[[int], list[Any]]) -> Competitor:
 
     def estimate(train: Dataset, judged: Dataset, target: str, seed: int) -> Float64:
         pipeline = make_pipeline(StandardScaler(), *make(seed))
-        with warnings.catch_warnings():
+        # How many threads share a product shows in the perceptron's last bits.
+        with threadpool_limits(1, "blas"), warnings.catch_warnings():
             # Whether the paper's perceptron has converged shows in its figures.
             warnings.simplefilter("ignore", ConvergenceWarning)
             pipeline.fit(train.matrix(), train.label(target) * CM_PER_M)
-        estimates: Float64 = pipeline.predict(judged.matrix()) / CM_PER_M
+            estimates: Float64 = pipeline.predict(judged.matrix()) / CM_PER_M
         return estimates
 
     return estimate

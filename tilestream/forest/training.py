@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from tilestream.errors import ModelError, UsageError
 from tilestream.forest.dataset import TARGETS, Dataset, with_derived
@@ -125,16 +126,18 @@ def train(
         raise UsageError(f"no recipe {recipe!r}: choose from {', '.join(RECIPES)}")
     dataset.check(MAIN)
     pieces = dataset.rows.groupby(["path", dataset.rows["arc_length"] // PIECE]).ngroups
-    typical = typical_of(dataset.matrix(), dataset.label(MAIN), dataset.columns, pieces)
-    dataset = dataset if recipe == "paper" else telling(dataset)
+    whole, dataset = dataset, dataset if recipe == "paper" else telling(dataset)
+    rows = dataset.rows
+    with threadpool_limits(1, "blas"):  # how many threads share a product shows in its last bits
+        typical = typical_of(whole.matrix(), whole.label(MAIN), whole.columns, pieces)
+        domain = domain_of(dataset.matrix(), rows["block"].to_numpy(str))
     grown = PAPER if recipe == "paper" else tuned(dataset, MAIN, seed, n_jobs)
     # An axis or a tail that is the same everywhere teaches nothing and is learnt as that constant.
     there = [target for target in TARGETS if target in dataset.rows]
     forests = {target: grow(dataset, target, grown, seed, n_jobs) for target in there}
-    rows = dataset.rows
     return Model(
         forests=forests,
-        domain=domain_of(dataset.matrix(), rows["block"].to_numpy(str)),
+        domain=domain,
         typical=typical,
         interval=_interval(dataset, grown, seed, n_jobs),
         factors=tuple(dataset.names),

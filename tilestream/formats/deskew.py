@@ -6,6 +6,7 @@ import numpy as np
 
 from tilestream.errors import PoseError, UsageError
 from tilestream.formats.poses import PoseStatus, interpolate
+from tilestream.kernels.fixed_order import turned
 from tilestream.records import Float64, Scan, Trajectory
 
 
@@ -70,6 +71,6 @@ def deskew(
             f"poses, from {lacking.min():.3f} to {lacking.max():.3f} s after its stamp"
         )
     T_stamp, T_point = T[which[-1]], T[which[:-1]]
-    in_map = np.einsum("nij,nj->ni", T_point[:, :3, :3], scan.points)
-    in_map += T_point[:, :3, 3] - T_stamp[:3, 3]
-    return replace(scan, points=in_map @ T_stamp[:3, :3], time_offset=np.zeros(len(scan.points)))
+    in_map = turned(T_point[:, :3, :3], scan.points) + (T_point[:, :3, 3] - T_stamp[:3, 3])
+    points = turned(T_stamp[:3, :3].T, in_map)
+    return replace(scan, points=points, time_offset=np.zeros(len(scan.points)))

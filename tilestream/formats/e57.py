@@ -19,6 +19,7 @@ from pyproj.exceptions import CRSError
 from tilestream.errors import CorruptSourceError
 from tilestream.formats.base import Block, SourceInfo, Span
 from tilestream.formats.rows import finite_block, whole_span
+from tilestream.kernels.fixed_order import turned
 from tilestream.records import Float64
 
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
@@ -204,7 +205,7 @@ def _pose(node: Any, i: int, path: str) -> tuple[Float64, Float64]:
             q = np.array([pose["rotation"][axis].value() for axis in "wxyz"])
         if pose.isDefined("translation"):
             t = np.array([pose["translation"][axis].value() for axis in "xyz"])
-    norm = math.sqrt(float(q @ q))
+    norm = math.hypot(*q)
     if not abs(norm - 1.0) < 1e-3 or not np.isfinite(t).all():
         raise CorruptSourceError(
             f"{path}: the pose of scan {i} is not rigid: quaternion {q.tolist()}, translation "
@@ -256,6 +257,6 @@ def _placed(scan: _Scan, columns: list[Float64], state: NDArray[np.int8]) -> Blo
         a = r * np.cos(elevation) * np.cos(azimuth)
         b = r * np.cos(elevation) * np.sin(azimuth)
         c = r * np.sin(elevation)
-    x, y, z = scan.R_map_scan @ np.stack([a, b, c]) + scan.t_map_scan[:, None]
-    block = finite_block(x, y, z)
+    points = turned(scan.R_map_scan, np.column_stack([a, b, c])) + scan.t_map_scan
+    block = finite_block(*np.ascontiguousarray(points.T))
     return Block(block.points, block.dropped + int(np.count_nonzero(~valid)))

@@ -4,6 +4,7 @@ Format: Lanelet2's OSM XML (a lanelet is a relation with the ways `left` and `ri
 `centerline`); Autoware's maps carry metric `local_x`, `local_y` and `ele` tags on every node.
 """
 
+import math
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from tilestream.errors import CorruptSourceError
 from tilestream.formats.route_files import DEGREES, Path3
+from tilestream.kernels.fixed_order import norms
 from tilestream.records import Float64
 
 NOT_FOR_VEHICLES = frozenset(
@@ -119,7 +121,7 @@ def _against(a: Float64, b: Float64) -> bool:
     """Whether two lines side by side run in opposite directions."""
 
     def apart(p: Float64, q: Float64) -> float:
-        return float(np.linalg.norm((p - q)[:2]))
+        return math.dist(p[:2], q[:2])
 
     return apart(a[0], b[-1]) + apart(a[-1], b[0]) < apart(a[0], b[0]) + apart(a[-1], b[-1])
 
@@ -140,7 +142,7 @@ def _middle(left: Float64, right: Float64) -> Float64:
 
 
 def _at_share(line: Float64, shares: Float64) -> Float64:
-    steps = np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1)
+    steps = norms(np.diff(line[:, :2], axis=0))
     along = np.concatenate([[0.0], np.cumsum(steps)])
     return np.column_stack([np.interp(shares * along[-1], along, column) for column in line.T])
 

@@ -20,6 +20,7 @@ from tilestream.formats.base import Block, SourceInfo, Span
 from tilestream.formats.log_poses import POSE_TYPES, PoseTrack, choose_poses
 from tilestream.formats.mcap_file import McapFile, Message, Topic
 from tilestream.formats.poses import PoseStatus, interpolate, transform
+from tilestream.kernels.fixed_order import norms
 from tilestream.records import Float64, Int64, Scan, Trajectory
 
 MAX_GAP_S = 1.0
@@ -156,7 +157,7 @@ class ScanLog:
         """What is in the log; of the scans, those given by index (default: all)."""
         used = np.arange(len(self)) if indices is None else indices
         posed = used[self.posed[used]]
-        path_m = np.linalg.norm(np.diff(self.T_map_lidar[posed, :3, 3], axis=0), axis=1).sum()
+        path_m = norms(np.diff(self.T_map_lidar[posed, :3, 3], axis=0)).sum()
         stamps = self.stamps_ns[used]
         duration_s = (stamps[-1] - stamps[0]) / 1e9 if len(stamps) else 0.0
         # a chunk packed and unpacked, and one scan's columns

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from tilestream.kernels.fixed_order import turned
 from tilestream.records import Float64, Int64, Trajectory
 
 
@@ -44,16 +45,8 @@ def inverse(T: Float64) -> Float64:
 
 
 def transform(T: Float64, points: Float64) -> Float64:
-    """(n, 3) points moved by one (4, 4) rigid motion.
-
-    Term by term and not as a matrix product, whose last bit depends on how many points it is given:
-    a point must come out the same in any block.
-    """
-    x, y, z = points.T
-    moved = np.empty_like(points)
-    for axis in range(3):
-        moved[:, axis] = x * T[axis, 0] + y * T[axis, 1] + z * T[axis, 2] + T[axis, 3]
-    return moved
+    """(n, 3) points moved by one (4, 4) rigid motion; a point comes out the same in any block."""
+    return turned(T[:3, :3], points) + T[:3, 3]
 
 
 def trajectory(stamps_ns: Int64, numbers: Float64, frame: str) -> tuple[Trajectory, int]:

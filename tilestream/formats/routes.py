@@ -22,6 +22,7 @@ from tilestream.errors import (
 from tilestream.formats.lanelet2 import read_lanelet2
 from tilestream.formats.mcap import open_log
 from tilestream.formats.route_files import Path3, read_csv, read_geojson, read_poses
+from tilestream.kernels.fixed_order import norms
 from tilestream.records import Float64, Route, Trajectory
 
 REPEATED_M = 0.01
@@ -182,7 +183,7 @@ def route_of(
         raise CorruptSourceError(
             f"{where}: {len(kept)} different points of {len(positions)}; a route needs at least 2"
         )
-    steps = np.linalg.norm(np.diff(known[kept], axis=0), axis=1)
+    steps = norms(np.diff(known[kept], axis=0))
     if steps.max() > max_jump:
         i = int(np.argmax(steps > max_jump))
         raise PoseError(
@@ -317,7 +318,7 @@ def _look_like_degrees(points: list[Float64], drawn: bool) -> bool:
     largest = np.abs(every).max(axis=0)
     if largest.min() > 90 or largest.max() > 180:
         return False
-    steps = np.concatenate([np.linalg.norm(np.diff(xyz[:, :2], axis=0), axis=1) for xyz in points])
+    steps = np.concatenate([norms(np.diff(xyz[:, :2], axis=0)) for xyz in points])
     steps = steps[steps > 0]
     extent = np.ptp(every, axis=0).max()
     return bool(extent > 0 and (extent < 1.0 or (drawn and np.median(steps) < 1e-3)))
@@ -357,6 +358,6 @@ def _heading(positions: Float64, arc_length: Float64, at: Float64) -> Float64:
     after = _at(xy, arc_length, np.minimum(at + TANGENT_M, arc_length[-1]))
     chord = after - before
     segment = np.clip(np.searchsorted(arc_length, at, side="right"), 1, len(arc_length) - 1)
-    returning = np.linalg.norm(chord, axis=1) < 1e-6
+    returning = norms(chord) < 1e-6
     chord[returning] = (xy[segment] - xy[segment - 1])[returning]
     return np.arctan2(chord[:, 1], chord[:, 0])

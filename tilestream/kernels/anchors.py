@@ -5,27 +5,28 @@ direct7, and l/2 for radius, where an anchor lists every cell that a point in it
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from tilestream.kernels.cache import njit
 
 Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]
 Int64 = NDArray[np.int64]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(nogil=True, error_model="numpy", inline="always")
 def _gap(mean, anchor):  # type: ignore[no-untyped-def]
     """Distance along an axis from `mean` to the interval [anchor, anchor + 1]."""
     return max(max(anchor - mean, mean - anchor - 1.0), 0.0)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(nogil=True, inline="always")
 def _pack(sx, sy, sz):  # type: ignore[no-untyped-def]
     """A shift of -8 to 7 anchor edges per axis in 12 bits."""
     return ((sx + 8) * 16 + sy + 8) * 16 + sz + 8
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _costs(mean, span, reach, cost):  # type: ignore[no-untyped-def]
     """Per axis and anchor around a cell's corner: faces away, or the squared gap to its mean.
 
@@ -38,7 +39,7 @@ def _costs(mean, span, reach, cost):  # type: ignore[no-untyped-def]
     return reach * reach if reach > 0.0 else float(span)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _visit(corner, mean, shape, span, reach, count, cursor, cell, shift):  # type: ignore[no-untyped-def]
     """Count the entries of every anchor, or, where `count` is empty, write them at `cursor`."""
     width = 2 * span + 1
@@ -63,7 +64,7 @@ def _visit(corner, mean, shape, span, reach, count, cursor, cell, shift):  # typ
                 cursor[a + k] = at + 1
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def neighbour_lists(
     corner: Int64, mean: Float64, shape: Int64, span: int, reach: float
 ) -> tuple[Int32, Int32, Int32]:

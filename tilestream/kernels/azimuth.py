@@ -1,7 +1,8 @@
 """The bin of an azimuth on the full circle, as definitions, section 1, "bins and ties" wants it."""
 
 import numpy as np
-from numba import njit
+
+from tilestream.kernels.cache import njit
 
 _TAU = 2.0 * np.pi
 # Least maximum error fit of arctan t = t (c0 + c1 t^2 + ... + c6 t^12) on [0, 1]: 2.5e-7 rad.
@@ -12,7 +13,7 @@ UNSURE = 1e-4
 4e-8 turns is less for up to 2500 bins."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(nogil=True, error_model="numpy", inline="always")
 def turns_guess(x, y):  # type: ignore[no-untyped-def]
     """atan2(y, x) mod 2 pi in turns, to 1e-7, without a branch: loops over it vectorise.
 
@@ -28,7 +29,7 @@ def turns_guess(x, y):  # type: ignore[no-untyped-def]
     return angle * (1.0 / _TAU)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def azimuth_bin_exactly(x, y, bins):  # type: ignore[no-untyped-def]
     """floor((atan2(y, x) mod 2 pi) / width + 1e-9), wrapped; azimuth 0 below 1e-9 horizontally."""
     if np.sqrt(x * x + y * y) < 1e-9:
@@ -37,7 +38,7 @@ def azimuth_bin_exactly(x, y, bins):  # type: ignore[no-untyped-def]
     return np.int64(np.floor(azimuth / (_TAU / bins) + 1e-9)) % bins
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(nogil=True, error_model="numpy", inline="always")
 def is_unsure(turns, bins):  # type: ignore[no-untyped-def]
     """Whether the guess of the turns lies so near to a bin's edge that it does not decide."""
     at = turns * bins

@@ -5,8 +5,9 @@ on the tiling (definitions, section 1). Lengths are millimetres in the sums and 
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from tilestream.kernels.cache import njit
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -18,7 +19,7 @@ COUNT, SX, SY, SZ, SXX, SXY, SXZ, SYY, SYZ, SZZ = range(10)
 """Columns of the sums of a voxel: 1, x, x x^T over its points [1, mm, mm^2]."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(nogil=True, error_model="numpy", inline="always")
 def voxel_of(x_mm, inverse_edge):  # type: ignore[no-untyped-def]
     """floor(x / edge) of whole millimetres, given 1 / edge [1/mm].
 
@@ -28,7 +29,7 @@ def voxel_of(x_mm, inverse_edge):  # type: ignore[no-untyped-def]
     return np.int64(np.floor((x_mm + 0.5) * inverse_edge))
 
 
-@njit(cache=True, nogil=True, boundscheck=False)
+@njit(nogil=True, boundscheck=False)
 def _bounds(points_mm):  # type: ignore[no-untyped-def]
     """Lowest and highest coordinates, one row each."""
     x_lo, y_lo, z_lo = points_mm[0, 0], points_mm[0, 1], points_mm[0, 2]
@@ -40,7 +41,7 @@ def _bounds(points_mm):  # type: ignore[no-untyped-def]
     return np.array([[x_lo, y_lo, z_lo], [x_hi, y_hi, z_hi]])
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def _number_voxels(points_mm, edge_mm, low, span, table):  # type: ignore[no-untyped-def]
     """Give every occupied voxel of the box a row, 0, 1, ... in `table`; the row of each point."""
     inverse = 1.0 / edge_mm
@@ -61,7 +62,7 @@ def _number_voxels(points_mm, edge_mm, low, span, table):  # type: ignore[no-unt
     return row_of_point, np.int64(used)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def _sum_voxels(points_mm, edge_mm, row_of_point, used):  # type: ignore[no-untyped-def]
     """Sums of the numbered voxels; rows are two cache lines wide, of which ten columns are used.
 
@@ -88,7 +89,7 @@ def _sum_voxels(points_mm, edge_mm, row_of_point, used):  # type: ignore[no-unty
     return rows
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _in_order(rows, low, span, table, min_points):  # type: ignore[no-untyped-def]
     """Index and sums of the voxels with at least `min_points` points, by rising voxel index."""
     kept = 0
@@ -155,14 +156,14 @@ def cell_sums(points_mm: Int64, edge_mm: int, min_points: int = 1) -> tuple[Int6
     return found
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(nogil=True, error_model="numpy", inline="always")
 def _covariance_mm2(n, sx, sy, sxy, exact):  # type: ignore[no-untyped-def]
     if exact:
         return (n * sxy - sx * sy) / (np.float64(n) * (n - 1))
     return (sxy - np.float64(sx) * sy / n) / (n - 1)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def moments(index: Int64, sums: Int64, edge_mm: int) -> tuple[Float64, Float64]:
     """Mean [m, map frame] and unbiased covariance [m^2] from the sums of `cell_sums`.
 
@@ -205,7 +206,7 @@ def moments(index: Int64, sums: Int64, edge_mm: int) -> tuple[Float64, Float64]:
     return mean, covariance
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(nogil=True, error_model="numpy", inline="always")
 def _rotated(app, aqq, apq, arp, arq, v0p, v0q, v1p, v1q, v2p, v2q):  # type: ignore[no-untyped-def]
     """One Jacobi rotation in the plane (p, q) that makes a_pq zero; r is the third axis."""
     if apq == 0.0:
@@ -230,7 +231,7 @@ def _rotated(app, aqq, apq, arp, arq, v0p, v0q, v1p, v1q, v2p, v2q):  # type: ig
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def eigen(covariance: Float64) -> tuple[Float64, Float64]:
     """Eigenvalues and eigenvectors of symmetric 3x3 matrices by cyclic Jacobi rotations.
 
@@ -284,7 +285,7 @@ def eigen(covariance: Float64) -> tuple[Float64, Float64]:
     return values, vectors
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def normals(eigenvalues: Float64, eigenvectors: Float64) -> Float64:
     """Unit normals (n, 3), each with the map-wide sign (definitions, section 1).
 
@@ -310,7 +311,7 @@ def normals(eigenvalues: Float64, eigenvectors: Float64) -> Float64:
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def regularise(eigenvalues: Float64, eigenvectors: Float64) -> tuple[Float64, Float64]:
     """Regularised covariances [m^2] and their inverses [1/m^2], (n, 3, 3) each.
 
@@ -333,7 +334,7 @@ def regularise(eigenvalues: Float64, eigenvectors: Float64) -> tuple[Float64, Fl
     return covariance, inverse
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def _look_up(points_mm, edge_mm, low, span, table):  # type: ignore[no-untyped-def]
     inverse = 1.0 / edge_mm
     lx, ly, lz = low[0], low[1], low[2]

@@ -5,10 +5,10 @@ its box can touch are all full already, and beyond some distance nearly all of t
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from tilestream.kernels.azimuth import azimuth_bin_exactly, is_unsure, turns_guess
+from tilestream.kernels.cache import njit
 from tilestream.kernels.vicinity import AT_PLACE
 
 COLUMNS = 360
@@ -17,7 +17,7 @@ MARGIN = 1e-6
 """What rounding may do to the bounds of a box, generously [m, or sine]."""
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def thin(index: NDArray[np.int64], sums: NDArray[np.int64], edge_mm: int) -> NDArray[np.int64]:
     """Centroids of voxels, integer sum / count, rounded to whole millimetres, half to even.
 
@@ -42,7 +42,7 @@ def thin(index: NDArray[np.int64], sums: NDArray[np.int64], edge_mm: int) -> NDA
     return out
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def row_guesses(edges: NDArray[np.float64]) -> NDArray[np.int32]:
     """The row at the beginning of each of many even steps from the lowest to the highest edge.
 
@@ -61,7 +61,7 @@ def row_guesses(edges: NDArray[np.float64]) -> NDArray[np.int32]:
     return guess
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def _row_of(s, edges, guess):  # type: ignore[no-untyped-def]
     """Row of the sine of an elevation; what lies beyond the outer edges is in the outer rows."""
     last = len(edges) - 2
@@ -74,7 +74,7 @@ def _row_of(s, edges, guess):  # type: ignore[no-untyped-def]
     return row
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def _in_view(box, first, last, place, reach, edges, out):  # type: ignore[no-untyped-def]
     """Boxes first to last that reach into the range and between the outer edges; their number."""
     px, py, pz = place[0], place[1], place[2]
@@ -97,7 +97,7 @@ def _in_view(box, first, last, place, reach, edges, out):  # type: ignore[no-unt
     return found
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def _is_full(box, i, place, edges, guess, image):  # type: ignore[no-untyped-def]
     """Whether no point of box i, which is in view, can fill a pixel that is still empty."""
     x0, y0, z0 = box[0, i] - place[0], box[1, i] - place[1], box[2, i] - place[2]
@@ -130,7 +130,7 @@ def _is_full(box, i, place, edges, guess, image):  # type: ignore[no-untyped-def
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def _directions(x, y, z, place, reach, sines, turns):  # type: ignore[no-untyped-def]
     """Sines of the elevations and turns of the azimuths of points; out of range: a sine of 2.
 
@@ -145,7 +145,7 @@ def _directions(x, y, z, place, reach, sines, turns):  # type: ignore[no-untyped
         turns[i] = turns_guess(dx, dy)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def _fill(x, y, z, place, reach, edges, guess, image, sines, turns, fresh, found):  # type: ignore[no-untyped-def]
     """Fill the pixels of some points; those that filled an empty one are added to `fresh`."""
     _directions(x, y, z, place, reach, sines, turns)
@@ -168,7 +168,7 @@ def _fill(x, y, z, place, reach, edges, guess, image, sines, turns, fresh, found
     return found
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def add_points(
     places: NDArray[np.float64],
     reach: float,

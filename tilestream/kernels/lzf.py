@@ -7,8 +7,9 @@ output, which it may overlap.
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from tilestream.kernels.cache import njit
 
 WHOLE = -1
 """What `decompress` returns for an undamaged stream."""
@@ -19,7 +20,7 @@ _DISTANCE_MAX = 8192
 _HASH_BITS = 14
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def decompress(packed: NDArray[np.uint8], unpacked: NDArray[np.uint8]) -> int:
     """Decode `packed` into `unpacked`; neither is read nor written out of bounds.
 
@@ -67,7 +68,7 @@ def decompress(packed: NDArray[np.uint8], unpacked: NDArray[np.uint8]) -> int:
     return WHOLE if o == n else m
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def compress(raw: NDArray[np.uint8], packed: NDArray[np.uint8]) -> int:
     """Encode `raw` into `packed` by a hash of the last place of every three bytes.
 
@@ -115,7 +116,7 @@ def compress(raw: NDArray[np.uint8], packed: NDArray[np.uint8]) -> int:
     return _literals(raw, literal, i, packed, o)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _literals(
     raw: NDArray[np.uint8], start: int, stop: int, packed: NDArray[np.uint8], o: int
 ) -> int:

@@ -1,8 +1,9 @@
 """How well the cells stand for their points: distances to the nearest mean (eqs. 19 to 21)."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from tilestream.kernels.cache import njit
 
 REACH = 2
 """A point's nearest mean lies at most this many voxels from the point's own cell: its own mean is
@@ -15,7 +16,7 @@ STEPS_PER_SIGMA = 2.0**30
 """Mahalanobis distances are summed as whole multiples of 2^-30."""
 
 
-@njit(cache=True, nogil=True, boundscheck=False)
+@njit(nogil=True, boundscheck=False)
 def group_by_cell(
     cell_of_point: NDArray[np.int64], cells: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -43,7 +44,7 @@ def group_by_cell(
     return start, order
 
 
-@njit(cache=True, nogil=True, boundscheck=False)
+@njit(nogil=True, boundscheck=False)
 def from_corner(points_mm, members, corner_mm):  # type: ignore[no-untyped-def]
     """Points as offsets from a voxel's corner [m], with the box that they fill.
 
@@ -61,7 +62,7 @@ def from_corner(points_mm, members, corner_mm):  # type: ignore[no-untyped-def]
     return offset, middle, half
 
 
-@njit(cache=True, nogil=True, boundscheck=False)
+@njit(nogil=True, boundscheck=False)
 def _rivals(mean, own, candidates, corner, middle, half, kept, at):  # type: ignore[no-untyped-def]
     """Which candidates can be as near to a point of the box as the cell's own mean; their number.
 
@@ -82,7 +83,7 @@ def _rivals(mean, own, candidates, corner, middle, half, kept, at):  # type: ign
     return found
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def nearest_mean_sums(
     points_mm: NDArray[np.int64],
     start: NDArray[np.int64],

@@ -1,8 +1,9 @@
 """Which cells are near which, as lists: the neighbours of definitions, section 3, and others."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from tilestream.kernels.cache import njit
 
 WITHIN = 1e-9
 """Distances that exceed a radius by no more than this are within it [m]: on regular maps rounding
@@ -32,7 +33,7 @@ def _keys(
     return narrowed @ np.array([step_x, step_y, 1]), step_x, step_y
 
 
-@njit(cache=True, nogil=True, boundscheck=False)
+@njit(nogil=True, boundscheck=False)
 def _list_near(  # type: ignore[no-untyped-def]
     key, step_x, step_y, reach, mean, radius, itself, fill, start, near
 ):

@@ -13,8 +13,9 @@ Everything here is float64 and 6x6.
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from tilestream.kernels.cache import njit
 
 Float64 = NDArray[np.float64]
 
@@ -32,7 +33,7 @@ SINGULAR = 1e-12
 """The raw solver calls a matrix singular below this ratio of its pivots."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def assemble(sums: Float64, g: Float64, H: Float64) -> None:
     """Gradient (6,) and Hessian (6, 6) of the score from the sums of a pose.
 
@@ -56,7 +57,7 @@ def assemble(sums: Float64, g: Float64, H: Float64) -> None:
         H[3 + i, 3 + i] += trace
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def to_euler(axes: Float64, g: Float64, H: Float64) -> None:
     """Turn a gradient and Hessian for R <- Exp(w) R into those for the angles of R = Rx Ry Rz.
 
@@ -86,7 +87,7 @@ def to_euler(axes: Float64, g: Float64, H: Float64) -> None:
             H[3 + i, 3 + j] = H[3 + j, 3 + i] = value
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _cholesky(A: Float64, shift: float, L: Float64) -> bool:
     """L L^T = A - shift I; False where that is not positive definite."""
     for i in range(6):
@@ -104,7 +105,7 @@ def _cholesky(A: Float64, shift: float, L: Float64) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _cholesky_solve(L: Float64, b: Float64, x: Float64) -> None:
     for i in range(6):
         value = b[i]
@@ -118,7 +119,7 @@ def _cholesky_solve(L: Float64, b: Float64, x: Float64) -> None:
         x[i] = value / L[i, i]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _rotate(A: Float64, V: Float64, p: int, q: int) -> None:
     """The Jacobi rotation that makes A[p, q] zero."""
     theta = (A[q, q] - A[p, p]) / (2.0 * A[p, q])
@@ -140,7 +141,7 @@ def _rotate(A: Float64, V: Float64, p: int, q: int) -> None:
         V[k, q] = s * x + c * y
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def eigen6(A: Float64, V: Float64) -> None:
     """Diagonalise a symmetric (6, 6) matrix in place by cyclic Jacobi; eigenvectors in columns."""
     for i in range(6):
@@ -160,7 +161,7 @@ def eigen6(A: Float64, V: Float64) -> None:
                     _rotate(A, V, p, q)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def definite_step(g: Float64, H: Float64, step_max: float, d: Float64) -> float:
     """Newton step (6,) into `d` that always climbs; its norm.
 
@@ -186,7 +187,7 @@ def definite_step(g: Float64, H: Float64, step_max: float, d: Float64) -> float:
     return _capped(d, step_max, 0.0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def raw_step(g: Float64, H: Float64, step_max: float, step_min: float, d: Float64) -> float:
     """Newton step (6,) into `d` as PCL takes it; its norm.
 
@@ -206,7 +207,7 @@ def raw_step(g: Float64, H: Float64, step_max: float, step_min: float, d: Float6
     return _capped(d, step_max, step_min)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _curved_solve(A, b, floor, lift, V, x):  # type: ignore[no-untyped-def]
     """Solve A x = b by x = V E^-1 V^T b where A = V E V^T, overwriting A, V.
 
@@ -233,7 +234,7 @@ def _curved_solve(A, b, floor, lift, V, x):  # type: ignore[no-untyped-def]
             x[i] += V[i, k] * (dot / e)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _eliminate(H: Float64, b: Float64, x: Float64) -> bool:
     """Solve H x = b by elimination with row pivoting; False where H is singular."""
     A = H.copy()
@@ -261,7 +262,7 @@ def _eliminate(H: Float64, b: Float64, x: Float64) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _capped(d: Float64, step_max: float, step_min: float) -> float:
     """Scale `d` to max(min(|d|, step_max), step_min); that norm, or 0 where d is 0."""
     norm = 0.0

@@ -5,8 +5,9 @@ pair of cells gives is computed once, from the smaller to the larger number, and
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from tilestream.kernels.cache import njit
 
 BINS = 125
 """Bins of a histogram: 5 each of alpha, phi (on [-1, 1]) and theta (on [-pi, pi])."""
@@ -16,19 +17,19 @@ UNKNOWN = 254
 """A pair that was not looked at yet."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(nogil=True, error_model="numpy", inline="always")
 def _fifth(x, low, width):  # type: ignore[no-untyped-def]
     """Bin of x in five equal bins of a closed range."""
     return min(max(int(np.floor((x - low) / width + 1e-9)), 0), 4)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(nogil=True, error_model="numpy", inline="always")
 def _snapped(x):  # type: ignore[no-untyped-def]
     """0 for magnitudes below 1e-9: on exact planes rounding would choose between -pi and pi."""
     return 0.0 if abs(x) < 1e-9 else x
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _pair_bin(mean, normal, i, j):  # type: ignore[no-untyped-def]
     """Bin of the Darboux angles of cells i and j, of which i comes first lexicographically.
 
@@ -61,7 +62,7 @@ def _pair_bin(mean, normal, i, j):  # type: ignore[no-untyped-def]
     return 5 * fifths + _fifth(theta, -np.pi, 0.4 * np.pi)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def pfh_counts(
     mean: NDArray[np.float64],
     normal: NDArray[np.float64],
@@ -110,7 +111,7 @@ def pfh_counts(
     return counts[:, :BINS].copy()
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def entropy_of_counts(counts: NDArray[np.int32]) -> NDArray[np.float64]:
     """Entropy of each row of counts [bit]; an empty bin adds 0, an empty row has NaN.
 
@@ -130,7 +131,7 @@ def entropy_of_counts(counts: NDArray[np.int32]) -> NDArray[np.float64]:
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def histogram_distances(
     counts: NDArray[np.int32], start: NDArray[np.int64], near: NDArray[np.int32]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -171,13 +172,13 @@ def histogram_distances(
     return sums, numbers
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(nogil=True, error_model="numpy", inline="always")
 def _determinant(a, b, c, d, e, f):  # type: ignore[no-untyped-def]
     """Determinant of the symmetric [[a, b, c], [b, d, e], [c, e, f]]."""
     return a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def bhattacharyya_sums(
     mean: NDArray[np.float64],
     covariance: NDArray[np.float64],

@@ -8,9 +8,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from tilestream.kernels.cache import njit
 from tilestream.kernels.newton import SUMS, M, assemble, definite_step, raw_step, to_euler
 from tilestream.kernels.slots import FAR, LN4, best_of_cells, forget_rows, sums_at
 
@@ -78,7 +78,7 @@ class Aligned(NamedTuple):
     """(k, 6, 6) of the score at the final pose, for steps (tau, w) [m, rad]."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _exponential(w: Float64, R: Float64) -> None:
     """R <- Exp(w) R, by Rodrigues' formula."""
     angle = math.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
@@ -94,7 +94,7 @@ def _exponential(w: Float64, R: Float64) -> None:
         R[2, j] = z + a * cz + b * (w[0] * cy - w[1] * cx)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _euler_angles(R: Float64, angles: Float64) -> None:
     """The angles (rx, ry, rz) of R = Rx Ry Rz [rad]."""
     angles[0] = math.atan2(-R[1, 2], R[2, 2])
@@ -102,7 +102,7 @@ def _euler_angles(R: Float64, angles: Float64) -> None:
     angles[2] = math.atan2(-R[0, 1], R[0, 0])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _from_euler(angles: Float64, ignored: float, R: Float64, axes: Float64) -> None:
     """R = Rx Ry Rz and the axes ex, Rx ey, Rx Ry ez of its angles; angles below `ignored` are 0."""
     rx, ry, rz = angles[0], angles[1], angles[2]
@@ -117,7 +117,7 @@ def _from_euler(angles: Float64, ignored: float, R: Float64, axes: Float64) -> N
     axes[0, 2], axes[1, 2], axes[2, 2] = sy, -sx * cy, cx * cy
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _newton_step(rule, axes, g, H, d):  # type: ignore[no-untyped-def]
     """The step `d` of a solver, from the gradient and Hessian for R <- Exp(w) R; its norm."""
     if rule.euler:
@@ -127,7 +127,7 @@ def _newton_step(rule, axes, g, H, d):  # type: ignore[no-untyped-def]
     return raw_step(g, H, rule.step_max, 0.5 * rule.epsilon, d)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _move(rule, d, angles, R, t, axes):  # type: ignore[no-untyped-def]
     """Apply a step to a pose."""
     for i in range(3):
@@ -140,14 +140,14 @@ def _move(rule, d, angles, R, t, axes):  # type: ignore[no-untyped-def]
         _exponential(d[3:], R)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _scale(sums: Float64, d1: float) -> None:
     """Give the sums of kernels/slots.py their constants (see kernels/newton.py)."""
     for k in range(SUMS + 1):
         sums[k] *= -d1 * LN4 if M <= k < SUMS else -d1
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def align(points, corner, local, rule, seven, limit, state, out):  # type: ignore[no-untyped-def]
     """Register a scan from every start; fills `out` (an `Aligned`).
 

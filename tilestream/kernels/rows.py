@@ -3,11 +3,12 @@
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from tilestream.kernels.cache import njit
 
-@njit(cache=True, nogil=True, error_model="numpy")
+
+@njit(nogil=True, error_model="numpy")
 def finite_points(
     x: NDArray[Any],
     y: NDArray[Any],

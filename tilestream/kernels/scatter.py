@@ -3,14 +3,15 @@
 The lattice is that of the definitions, section 1: floor division of millimetres.
 """
 
-import numba
 import numpy as np
+
+from tilestream.kernels.cache import njit
 
 SPLITMIX = np.uint64(0x9E3779B97F4A7C15)
 """2^64 / golden ratio, the increment of the splitmix64 generator (Steele et al. 2014)."""
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def round_to_mm(points, limits_mm, out):  # type: ignore[no-untyped-def]
     """Coordinates in metres to whole millimetres, half to even.
 
@@ -31,7 +32,7 @@ def round_to_mm(points, limits_mm, out):  # type: ignore[no-untyped-def]
     return -1
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@njit(nogil=True, inline="always")
 def mix(z):  # type: ignore[no-untyped-def]
     """The finaliser of splitmix64: 64 bits in, 64 well mixed bits out."""
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -39,7 +40,7 @@ def mix(z):  # type: ignore[no-untyped-def]
     return z ^ (z >> np.uint64(31))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def tile_bounds(points_mm, tile_mm):  # type: ignore[no-untyped-def]
     """The lowest and highest tile index of the points, as (ix_lo, iy_lo, ix_hi, iy_hi)."""
     x_lo = x_hi = points_mm[0, 0]
@@ -51,7 +52,7 @@ def tile_bounds(points_mm, tile_mm):  # type: ignore[no-untyped-def]
     return x_lo // tile_mm, y_lo // tile_mm, x_hi // tile_mm, y_hi // tile_mm
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def tile_of_points(points_mm, tile_mm, ix_lo, iy_lo, rows, tile_of, counts):  # type: ignore[no-untyped-def]
     """Which tile of a dense window owns each point, and how many each tile owns.
 
@@ -73,7 +74,7 @@ def tile_of_points(points_mm, tile_mm, ix_lo, iy_lo, rows, tile_of, counts):  # 
         counts[tile_of[i]] += 1
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def group_by_tile(points_mm, tile_of, tile_mm, ix_lo, iy_lo, rows, next_row, out, prints):  # type: ignore[no-untyped-def]
     """Copy the points tile by tile, relative to their tile's origin, and fingerprint each tile.
 

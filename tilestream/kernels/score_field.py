@@ -18,9 +18,9 @@ that cheap, without changing which cell is found:
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from tilestream.kernels.cache import njit
 from tilestream.kernels.nearest import from_corner
 
 SIDE = 21
@@ -86,7 +86,7 @@ class Lanes(NamedTuple):
     """(GROUP,) exponent of that cell's value."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(nogil=True, error_model="numpy", inline="always")
 def _value(exponent):  # type: ignore[no-untyped-def]
     """2^-exponent as a whole number of 2^-24, for exponents from 0 to `CAP`, rounded down."""
     whole = np.int32(exponent)
@@ -95,7 +95,7 @@ def _value(exponent):  # type: ignore[no-untyped-def]
     return np.int32(one >> (whole & 31))
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(nogil=True, error_model="numpy", inline="always")
 def _at_shift(slope, k, i, j):  # type: ignore[no-untyped-def]
     """T, G1.v and G2.v of cell k at the shift (i, j)."""
     return (
@@ -105,13 +105,13 @@ def _at_shift(slope, k, i, j):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(nogil=True, error_model="numpy", inline="always")
 def _limit(pull, limited, limit, p, i, j):  # type: ignore[no-untyped-def]
     """The distance from which on there is no cell for point p at the shift (i, j)."""
     return np.int32(limit - np.int32(i * pull[limited, p]) - np.int32(j * pull[limited, p + GROUP]))
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(nogil=True, error_model="numpy", inline="always")
 def _nearer(found, A, U, k, p, shift):  # type: ignore[no-untyped-def]
     """The distance and the exponent found so far for point p, or those of cell k."""
     least, exponent = found
@@ -121,7 +121,7 @@ def _nearer(found, A, U, k, p, shift):  # type: ignore[no-untyped-def]
     return min(far, least), here if far < least else exponent
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False, fastmath={"contract"})
+@njit(nogil=True, error_model="numpy", boundscheck=False, fastmath={"contract"})
 def _sum_of_two(A, U, slope, alive, pull, base, limited, i0, j0, total):  # type: ignore[no-untyped-def]
     """Add the values of a group in a block of shifts where two cells are alive."""
     a, b = alive[0], alive[1]
@@ -139,7 +139,7 @@ def _sum_of_two(A, U, slope, alive, pull, base, limited, i0, j0, total):  # type
         total[i + 10, j + 10] += values
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False, fastmath={"contract"})
+@njit(nogil=True, error_model="numpy", boundscheck=False, fastmath={"contract"})
 def _sum_of_four(A, U, slope, alive, pull, base, limited, i0, j0, total):  # type: ignore[no-untyped-def]
     """Add the values of a group in a block of shifts where four cells are alive."""
     a, b, c, d = alive[0], alive[1], alive[2], alive[3]
@@ -161,7 +161,7 @@ def _sum_of_four(A, U, slope, alive, pull, base, limited, i0, j0, total):  # typ
         total[i + 10, j + 10] += values
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False, fastmath={"contract"})
+@njit(nogil=True, error_model="numpy", boundscheck=False, fastmath={"contract"})
 def _sum_of_eight(A, U, slope, alive, pull, base, limited, i0, j0, total):  # type: ignore[no-untyped-def]
     """Add the values of a group in a block of shifts where eight cells are alive."""
     a, b, c, d = alive[0], alive[1], alive[2], alive[3]
@@ -192,7 +192,7 @@ def _sum_of_eight(A, U, slope, alive, pull, base, limited, i0, j0, total):  # ty
         total[i + 10, j + 10] += values
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False, fastmath={"contract"})
+@njit(nogil=True, error_model="numpy", boundscheck=False, fastmath={"contract"})
 def _sum_of_many(A, U, slope, alive, count, pull, base, limited, i0, j0, total, least, exponent):  # type: ignore[no-untyped-def]
     """Add the values of a group where more cells are alive: first find each point's distance."""
     for s in range(BLOCK * BLOCK):
@@ -219,7 +219,7 @@ def _sum_of_many(A, U, slope, alive, count, pull, base, limited, i0, j0, total, 
         total[i + 10, j + 10] += values
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def _by_place(offset, cell_size):  # type: ignore[no-untyped-def]
     """An order of a cell's points in which those that follow each other lie together.
 
@@ -243,7 +243,7 @@ def _by_place(offset, cell_size):  # type: ignore[no-untyped-def]
     return order
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _horizontal_axes(precision, covariance, bits):  # type: ignore[no-untyped-def]
     """The Mahalanobis form of each cell, taken apart so that shifts enter two squares only.
 
@@ -275,7 +275,7 @@ def _horizontal_axes(precision, covariance, bits):  # type: ignore[no-untyped-de
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def _within_reach(mean, axes, candidates, corner, middle, half, limit, scale, near):  # type: ignore[no-untyped-def]
     """Keep the candidates that some shift brings within the limit of the box; their number."""
     at, white, slope = near.at, near.white, near.slope
@@ -298,7 +298,7 @@ def _within_reach(mean, axes, candidates, corner, middle, half, limit, scale, ne
     return found
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def _take_group(offset, members, scale, lanes, middle, half):  # type: ignore[no-untyped-def]
     """Load the points of a group (the last one again in the lanes left), and their box."""
     x, pull = lanes.x, lanes.pull
@@ -314,7 +314,7 @@ def _take_group(offset, members, scale, lanes, middle, half):  # type: ignore[no
         pull[1, p + GROUP] = np.int32(np.rint(2.0 * STEP * scale * x[1, p]))
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def _tabulate(near, lanes, k, n, scale):  # type: ignore[no-untyped-def]
     """What the n points of a group are to the k-th cell."""
     x, y, z = lanes.x[0], lanes.x[1], lanes.x[2]
@@ -343,7 +343,7 @@ def _tabulate(near, lanes, k, n, scale):  # type: ignore[no-untyped-def]
         U[p + 2 * GROUP] = CAP  # a lane without a point is worth nothing
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def _choose(near, cells, cx, cy, cz, hx, hy, hz, limit, slack):  # type: ignore[no-untyped-def]
     """The cells that can be nearest, and within the limit, in a box of centre c and half size h.
 
@@ -375,7 +375,7 @@ def _choose(near, cells, cx, cy, cz, hx, hy, hz, limit, slack):  # type: ignore[
     return count, np.int64(limited)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def _is_dark(near, count, i, j):  # type: ignore[no-untyped-def]
     """Whether all values in the block around the shift (i, j) are 0."""
     r = 0.5 * (BLOCK - 1)
@@ -391,7 +391,7 @@ def _is_dark(near, count, i, j):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def _add_group(near, cells, lanes, middle, half, limit, scale, total):  # type: ignore[no-untyped-def]
     """Add the values of a group over all the shifts."""
     slack = (SET_BACK * cells + 8.0) / scale
@@ -420,7 +420,7 @@ def _add_group(near, cells, lanes, middle, half, limit, scale, total):  # type: 
                 )
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def score_sums(
     points_mm: NDArray[np.int64],
     start: NDArray[np.int64],

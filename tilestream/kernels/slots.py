@@ -17,9 +17,11 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import config, njit, types
+from numba import config, types
 from numba.core.extending import intrinsic
 from numpy.typing import NDArray
+
+from tilestream.kernels.cache import njit
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -122,7 +124,7 @@ _LEAST = np.float32(-100.0)
 _MANTISSA = np.int32(23)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=EXACT_ENOUGH)
+@njit(nogil=True, error_model="numpy", fastmath=EXACT_ENOUGH)
 def _exp2(x):  # type: ignore[no-untyped-def]
     """2^x in float32 for x <= 0, 2^-100 below -100. Not reassociated: that undoes the rounding."""
     x = max(x, _LEAST)
@@ -133,7 +135,7 @@ def _exp2(x):  # type: ignore[no-untyped-def]
     return np.int32(p.view(np.int32) + exponent).view(np.float32)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False, fastmath=True)
+@njit(nogil=True, error_model="numpy", boundscheck=False, fastmath=True)
 def _add_cell(a, cells, k, ux, uy, uz, limit):  # type: ignore[no-untyped-def]
     """Add the cell at `k` to the sums of a row: p, 2 ln 2 p f and p (B - 2 ln 2 f f^T).
 
@@ -171,7 +173,7 @@ def _add_cell(a, cells, k, ux, uy, uz, limit):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False, fastmath=True)
+@njit(nogil=True, error_model="numpy", boundscheck=False, fastmath=True)
 def _reduce(cells, points, blocks, limit, seven, sums):  # type: ignore[no-untyped-def]
     """Add the sums of all rows to `sums`: those of kernels/newton.py, then p; without constants.
 
@@ -227,7 +229,7 @@ def _reduce(cells, points, blocks, limit, seven, sums):  # type: ignore[no-untyp
         # fmt: on
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False, fastmath=EXACT_ENOUGH)
+@njit(nogil=True, error_model="numpy", boundscheck=False, fastmath=EXACT_ENOUGH)
 def _locate(points, R, lever, t, corner, shape, edge, rows, anchor):  # type: ignore[no-untyped-def]
     """u, r and the anchor of every point.
 
@@ -269,13 +271,13 @@ def _locate(points, R, lever, t, corner, shape, edge, rows, anchor):  # type: ig
             anchor[k] = np.int32((ax * ny + ay) * nz + az)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False, inline="always")
+@njit(nogil=True, error_model="numpy", boundscheck=False, inline="always")
 def _slot(row, slots):  # type: ignore[no-untyped-def]
     """Where the first slot of a row begins in `Slots.cells`; a slot takes `_CELL` more."""
     return (row // _BLOCK) * (slots * _CELL) + row % _BLOCK
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def _clear(cells, row, slots, far):  # type: ignore[no-untyped-def]
     """Empty all slots of a row; the inverse covariances that they hold stay."""
     k = _slot(row, slots)
@@ -284,7 +286,7 @@ def _clear(cells, row, slots, far):  # type: ignore[no-untyped-def]
         k += _CELL
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def _initialise(cells, used, slots, far):  # type: ignore[no-untyped-def]
     """Fill the blocks in use that never were with empty slots."""
     while used[2] * BLOCK < used[0]:
@@ -298,7 +300,7 @@ def _initialise(cells, used, slots, far):  # type: ignore[no-untyped-def]
         used[2] += 1
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def _further_row(cells, used, owner, following, more, i, slots, far):  # type: ignore[no-untyped-def]
     """A row behind those of the points, for point `i` that has more cells than slots."""
     row = used[1]
@@ -314,7 +316,7 @@ def _further_row(cells, used, owner, following, more, i, slots, far):  # type: i
     return row
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def _repack(state, local, slots, far):  # type: ignore[no-untyped-def]
     """Copy the cells of its anchor into the slots of every point that moved to another one.
 
@@ -360,7 +362,7 @@ def _repack(state, local, slots, far):  # type: ignore[no-untyped-def]
             slot += np.uint64(1)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def _copy_points(state):  # type: ignore[no-untyped-def]
     """Give further rows the u and r of their point."""
     points, owner = state.points, state.owner
@@ -374,7 +376,7 @@ def _copy_points(state):  # type: ignore[no-untyped-def]
             here += _1
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def forget_rows(state, slots, far):  # type: ignore[no-untyped-def]
     """Before a start: what it computes must not depend on where an earlier start left its rows."""
     n = state.anchor.size
@@ -387,7 +389,7 @@ def forget_rows(state, slots, far):  # type: ignore[no-untyped-def]
     state.more[:] = -1
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def sums_at(state, points, R, lever, t, corner, local, seven, limit, sums):  # type: ignore[no-untyped-def]
     """The sums of one pose (see `_reduce`), without constants, into `sums`."""
     slots = np.uint64(1) if seven is None else np.uint64(7)
@@ -400,7 +402,7 @@ def sums_at(state, points, R, lever, t, corner, local, seven, limit, sums):  # t
     _reduce(state.cells, state.points, -(-state.used[0] // BLOCK), limit, seven, sums)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def _total_and_hits(best, n):  # type: ignore[no-untyped-def]
     """The sum and the number of the values above 0.
 
@@ -413,7 +415,7 @@ def _total_and_hits(best, n):  # type: ignore[no-untyped-def]
     return total, hits
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False, fastmath=True)
+@njit(nogil=True, error_model="numpy", boundscheck=False, fastmath=True)
 def best_of_cells(state, slots, limit):  # type: ignore[no-untyped-def]
     """At the pose last summed: the sum over points of their best cell's density, and the hits.
 

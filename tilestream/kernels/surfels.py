@@ -4,9 +4,9 @@ Lengths that belong to a surfel are in edges of its voxel, 0.2 m by default.
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from tilestream.kernels.cache import njit
 from tilestream.kernels.cells import eigen
 
 Float64 = NDArray[np.float64]
@@ -30,7 +30,7 @@ NORMAL_ONE = 32767
 """A component of 1 of a stored normal."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def _neighbour_sums(points, column, first, rows, reach, wanted, out):  # type: ignore[no-untyped-def]
     """1, x, x x^T over the points within `reach` [mm] of each wanted point.
 
@@ -70,7 +70,7 @@ def _neighbour_sums(points, column, first, rows, reach, wanted, out):  # type: i
                     j += 1
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _covariances(sums: Int64) -> Float64:
     """(n, 3, 3) unbiased covariances [mm^2] of the sums, exact in the numerator; 0 of one point."""
     out = np.zeros((len(sums), 3, 3))
@@ -87,7 +87,7 @@ def _covariances(sums: Int64) -> Float64:
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _shape(points, sums, values, vectors, edge, centre, normal, radius):  # type: ignore[no-untyped-def]
     """Disc or ball, from the principal axes of the points around each point."""
     for i in range(len(sums)):

@@ -4,11 +4,12 @@ definitions, section 1, "map points": integer sum / count, rounded to 1 mm (half
 the result depends neither on the order nor on the blocks in which the points arrive.
 """
 
-import numba
 import numpy as np
 
+from tilestream.kernels.cache import njit
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+
+@njit(nogil=True, error_model="numpy")
 def place_rows(points, keys, next_row, out):  # type: ignore[no-untyped-def]
     """Copy points to the places of their keys: one pass of a stable counting sort.
 
@@ -26,7 +27,7 @@ def place_rows(points, keys, next_row, out):  # type: ignore[no-untyped-def]
         out[row, 2] = points[i, 2]
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@njit(nogil=True, inline="always")
 def rounded_mean(base, total, count):  # type: ignore[no-untyped-def]
     """The whole number nearest to base + total / count, half to even; total >= 0, count > 0."""
     quotient = base + total // count
@@ -36,7 +37,7 @@ def rounded_mean(base, total, count):  # type: ignore[no-untyped-def]
     return quotient
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def voxel_end(points, start, edge, corner):  # type: ignore[no-untyped-def]
     """Where the voxel of a point ends among points in the order of their voxels.
 
@@ -61,7 +62,7 @@ def voxel_end(points, start, edge, corner):  # type: ignore[no-untyped-def]
     return stop
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def centroids(points, edge, origin, out):  # type: ignore[no-untyped-def]
     """The centroid of each voxel, rounded as a coordinate of the map, whatever the tile.
 
@@ -90,7 +91,7 @@ def centroids(points, edge, origin, out):  # type: ignore[no-untyped-def]
     return voxels
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def sort_in_voxels(points, edge):  # type: ignore[no-untyped-def]
     """Sort the points of each voxel by x, y, z, in place.
 

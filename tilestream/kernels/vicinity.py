@@ -6,10 +6,10 @@ route only a few cells in a hundred enter or leave from one point to the next.
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from tilestream.kernels.azimuth import azimuth_bin_exactly, is_unsure, turns_guess
+from tilestream.kernels.cache import njit
 
 ONE = 2.0**40
 """Fixed point of what depends on the place: a share of 1 (r/R, (r/R)^2, u u^T) is this number."""
@@ -26,7 +26,7 @@ AZIMUTHS = 90
 """Bins of the azimuths of cells around a sample point."""
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def blocks_of(order_key: NDArray[np.int64], x, y, z):  # type: ignore[no-untyped-def]
     """Runs of equal keys, and the box of what is in each.
 
@@ -57,7 +57,7 @@ def blocks_of(order_key: NDArray[np.int64], x, y, z):  # type: ignore[no-untyped
     return start[: b + 1].copy(), box
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _out_of_view(box, place, reach, low, high):  # type: ignore[no-untyped-def]
     """Whether nothing in a box can be in the vicinity: too far, all above or all below."""
     near, far = 0.0, 0.0
@@ -76,7 +76,7 @@ def _out_of_view(box, place, reach, low, high):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def _view_block(x, y, z, place, reach, low, high, inside, sector, view):  # type: ignore[no-untyped-def]
     """Which cells of a block are in the vicinity, and their bin of azimuth (others: AZIMUTHS).
 
@@ -126,7 +126,7 @@ def _view_block(x, y, z, place, reach, low, high, inside, sector, view):  # type
                 sector[i] = azimuth_bin_exactly(dx, dy, AZIMUTHS)
 
 
-@njit(cache=True, nogil=True, boundscheck=False)
+@njit(nogil=True, boundscheck=False)
 def _enter_or_leave(c, sign, narrow, wide, exponent, bins, sums, wide_sums, counts):  # type: ignore[no-untyped-def]
     """Add the terms of cell c to a sample point's sums, or take them away."""
     for j in range(narrow.shape[1]):
@@ -142,7 +142,7 @@ def _enter_or_leave(c, sign, narrow, wide, exponent, bins, sums, wide_sums, coun
         counts[bins[c, j]] += np.int32(sign)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def add_cells(
     places: NDArray[np.float64],
     reach: float,
@@ -231,7 +231,7 @@ def add_cells(
         out_azimuth[p, 1] += sectors[1, :AZIMUTHS]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def add_weights(
     places: NDArray[np.float64],
     reach: float,

@@ -12,8 +12,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from tilestream.kernels.cache import njit
 
 Float64 = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -54,7 +55,7 @@ class Bricks(NamedTuple):
     """(n, 8) surfels, columns `X` to `RADIUS`."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def mark_bricks(surfels: Float32, edge: int, grid: Int32) -> int:
     """Number the bricks of the grid that surfels may enter; return how many there are."""
     inverse = 1.0 / (BRICK * edge)
@@ -73,7 +74,7 @@ def mark_bricks(surfels: Float32, edge: int, grid: Int32) -> int:
     return count
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _closer(surfels, a, b, x, y, z):  # type: ignore[no-untyped-def]
     """Whether the centre of surfel a is nearer to (x, y, z) than that of b; as near: comes first,
     lexicographically. All are multiples of half a millimetre: no rounding decides.
@@ -88,7 +89,7 @@ def _closer(surfels, a, b, x, y, z):  # type: ignore[no-untyped-def]
     return False
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def fill_bricks(surfels: Float32, edge: int, grid: Int32, voxels: Int32) -> None:
     """Give every voxel the nearest of the surfels that enter it.
 
@@ -126,7 +127,7 @@ def fill_bricks(surfels: Float32, edge: int, grid: Int32, voxels: Int32) -> None
                         voxels[b, v] = s
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def bound_bricks(edge: int, grid: Int32, voxels: Int32) -> Float32:
     """(bricks, 6) the box of the voxels of each brick that are not free [mm from the corner]."""
     bounds = np.empty((len(voxels), 6), np.float32)
@@ -148,7 +149,7 @@ def bound_bricks(edge: int, grid: Int32, voxels: Int32) -> Float32:
     return bounds
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False, inline="always")
+@njit(nogil=True, error_model="numpy", boundscheck=False, inline="always")
 def _meet(surfel, px, py, pz, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Range at which a ray from p [mm from the grid's corner] along d meets the plane of a disc, or
     passes the centre of a ball [mm]; by how much it misses the surfel [mm^2], inf of a ball; cosine
@@ -169,7 +170,7 @@ def _meet(surfel, px, py, pz, dx, dy, dz):  # type: ignore[no-untyped-def]
     return t, miss if slope != 0.0 or miss <= 0.0 else np.inf, cosine
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(nogil=True, error_model="numpy", inline="always")
 def _crossing(position, index, d, size):  # type: ignore[no-untyped-def]
     """Where a ray leaves the box `index` of an axis, and how far apart such borders are [mm]."""
     if d > 0.0:
@@ -179,14 +180,14 @@ def _crossing(position, index, d, size):  # type: ignore[no-untyped-def]
     return np.inf, np.inf
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(nogil=True, error_model="numpy", inline="always")
 def _voxel_at(position, brick, edge):  # type: ignore[no-untyped-def]
     """Voxel of a coordinate [mm] along an axis, kept in its brick, and counted from its corner."""
     voxel = np.int64(math.floor(position / edge)) - brick * BRICK
     return min(max(voxel, 0), BRICK - 1)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False, inline="always")
+@njit(nogil=True, error_model="numpy", boundscheck=False, inline="always")
 def _slab(low, high, position, inverse, t, t_out):  # type: ignore[no-untyped-def]
     """What of a ray from t to t_out lies between two planes of an axis; a little more."""
     first = (np.float64(low) - position) * inverse
@@ -194,7 +195,7 @@ def _slab(low, high, position, inverse, t, t_out):  # type: ignore[no-untyped-de
     return max(t, min(first, second) - ROUNDING), min(t_out, max(first, second) + ROUNDING)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def _through_brick(voxels, surfels, edge, brick, start, p, d, t, t_out, near, best):  # type: ignore[no-untyped-def]
     """The first surfel met in a brick between t and t_out, if nearer than `best` [mm].
 
@@ -236,7 +237,7 @@ def _through_brick(voxels, surfels, edge, brick, start, p, d, t, t_out, near, be
     return best, cosine
 
 
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+@njit(nogil=True, error_model="numpy", boundscheck=False)
 def cast(
     bricks: Bricks,
     place_mm: Int64,
@@ -321,7 +322,7 @@ def cast(
         out_cosine[n] = cosine if met else 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def leave_map(
     mapped: NDArray[np.bool_],
     corner: Int64,

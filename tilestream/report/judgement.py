@@ -1,5 +1,7 @@
 """What is read off the estimates: lengths, the share over a threshold, segments, worst places."""
 
+import math
+
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
@@ -115,6 +117,6 @@ def worst_places(places: pd.DataFrame, count: int = WORST, apart: float = APART)
     for row in np.argsort(-estimate, kind="stable").tolist():
         if len(chosen) == count or np.isnan(estimate[row]):
             break
-        if all(np.linalg.norm(at[row] - at[other]) >= apart for other in chosen):
+        if all(math.dist(at[row], at[other]) >= apart for other in chosen):
             chosen.append(row)
     return chosen

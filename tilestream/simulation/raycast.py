@@ -1,6 +1,6 @@
-"""First hits of rays on triangles: the one place that knows Open3D."""
+"""First hits of rays on triangles: the one place that knows Embree, and who brings it."""
 
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,21 +10,98 @@ from tilestream.kernels import cells as _numba_first  # noqa: F401  Open3D bring
 from tilestream.records import Float64
 from tilestream.simulation.mesh import Mesh
 
+Float32 = NDArray[np.float32]
 
-def _open3d() -> Any:
-    """Open3D, loaded when the first scene is built: it takes seconds and 100 MB.
+
+class Caster(Protocol):
+    """Triangles in float32 that rays are cast at."""
+
+    def cast(
+        self, start: Float32, direction: Float32
+    ) -> tuple[Float32, NDArray[np.int32], Float32]:
+        """What rays meet first.
+
+        Args:
+            start: (n, 3) where rays begin [m].
+            direction: (n, 3) unit vectors.
+
+        Returns:
+            (n,) ranges [m]; (n,) numbers of the triangles, -1 where nothing is met; (n, 3) their
+            normals, of any length. Ranges and normals mean nothing where nothing is met.
+        """
+
+
+class Embree:
+    """Embree by its own Python binding, a wheel without system libraries.
+
+    Args:
+        corners: (m, 3, 3) corners of the triangles [m].
 
     Raises:
-        UsageError: it cannot be loaded; says what is missing.
+        ImportError: embreex cannot be loaded.
     """
-    try:
-        import open3d  # noqa: PLC0415 - see the docstring
-    except ImportError as missing:
-        raise UsageError(
-            f"the simulation needs Open3D, which cannot be loaded: {missing}. Install open3d-cpu; "
-            "on a bare Debian also: apt-get install libgl1 libegl1 libx11-6 libusb-1.0-0"
-        ) from None
-    return open3d
+
+    def __init__(self, corners: Float32) -> None:
+        from embreex.mesh_construction import TriangleMesh  # noqa: PLC0415 - 40 MB, and optional
+        from embreex.rtcore_scene import EmbreeScene  # noqa: PLC0415
+
+        # Robust: no ray slips through the edge that two triangles share.
+        self._scene: Any = EmbreeScene(robust=True)
+        TriangleMesh(self._scene, corners)
+
+    def cast(
+        self, start: Float32, direction: Float32
+    ) -> tuple[Float32, NDArray[np.int32], Float32]:
+        """See `Caster`."""
+        hit = self._scene.run(start, direction, output=True)
+        return hit["tfar"], hit["primID"], hit["Ng"]
+
+
+class Open3D:
+    """The Embree inside Open3D, for where embreex has no wheel; needs libGL, libX11 and others.
+
+    Args:
+        corners: (m, 3, 3) corners of the triangles [m].
+
+    Raises:
+        ImportError: Open3D cannot be loaded.
+    """
+
+    def __init__(self, corners: Float32) -> None:
+        from open3d import core, t  # noqa: PLC0415 - seconds and 100 MB
+
+        self._tensor = core.Tensor.from_numpy
+        self._scene = t.geometry.RaycastingScene()
+        rows = np.arange(3 * len(corners), dtype=np.uint32).reshape(-1, 3)
+        self._scene.add_triangles(self._tensor(corners.reshape(-1, 3)), self._tensor(rows))
+
+    def cast(
+        self, start: Float32, direction: Float32
+    ) -> tuple[Float32, NDArray[np.int32], Float32]:
+        """See `Caster`."""
+        hit = self._scene.cast_rays(self._tensor(np.hstack([start, direction])), nthreads=1)
+        triangle = hit["primitive_ids"].numpy().view(np.int32)  # its invalid number becomes -1
+        return hit["t_hit"].numpy(), triangle, hit["primitive_normals"].numpy()
+
+
+def caster_of(corners: Float32) -> Caster:
+    """The first caster that can be loaded here.
+
+    Raises:
+        UsageError: none can; says what is missing.
+    """
+    missing = []
+    for caster in (Embree, Open3D):
+        try:
+            return caster(corners)
+        except ImportError as error:
+            missing.append(str(error))
+    raise UsageError(
+        "the simulation casts rays with embreex, or with Open3D where embreex has no wheel; "
+        f"neither can be loaded: {'; '.join(missing)}. Run pip install embreex; if it finds no "
+        "wheel, pip install open3d, which on a bare Debian also needs apt-get install libgl1 "
+        "libegl1 libx11-6 libusb-1.0-0"
+    )
 
 
 class Scene:
@@ -33,17 +110,16 @@ class Scene:
     Args:
         mesh: the triangles [m, map frame].
         origin: (3,) a place near all of them [m]; sub-millimetre within 5 km of it.
+
+    Raises:
+        UsageError: no caster can be loaded.
     """
 
     def __init__(self, mesh: Mesh, origin: Float64) -> None:
         self.origin = np.asarray(origin, np.float64)
         self._material = mesh.material
-        self._scene = _open3d().t.geometry.RaycastingScene()
-        if len(mesh):
-            corners = (mesh.corners - self.origin).astype(np.float32).reshape(-1, 3)
-            rows = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
-            self._scene.add_triangles(_tensor(corners), _tensor(rows))
-        self._empty = not len(mesh)
+        corners = (mesh.corners - self.origin).astype(np.float32)
+        self._caster = caster_of(corners) if len(mesh) else None
 
     def first_hits(
         self, start: Float64, direction: Float64
@@ -59,19 +135,16 @@ class Scene:
             (n,) materials, 0 where nothing is met.
         """
         n = len(start)
-        if self._empty:
-            return np.full(n, np.inf), np.zeros(n), np.zeros(n, np.uint8)
-        rays = np.empty((n, 6), np.float32)
-        rays[:, :3] = start - self.origin
-        rays[:, 3:] = direction
-        hit = self._scene.cast_rays(_tensor(rays), nthreads=1)
-        ranges = hit["t_hit"].numpy().astype(np.float64)
-        normal = hit["primitive_normals"].numpy().astype(np.float64)
-        cosine = np.minimum(np.abs((normal * direction).sum(axis=1)), 1.0)
-        met = np.isfinite(ranges)
-        triangle = np.where(met, hit["primitive_ids"].numpy(), 0).astype(np.int64)
-        return ranges, np.where(met, cosine, 0.0), np.where(met, self._material[triangle], 0)
-
-
-def _tensor(array: Any) -> Any:
-    return _open3d().core.Tensor.from_numpy(array)
+        ranges, cosine, material = np.full(n, np.inf), np.zeros(n), np.zeros(n, np.uint8)
+        if self._caster is None:
+            return ranges, cosine, material
+        reach, triangle, normal = self._caster.cast(
+            (start - self.origin).astype(np.float32), direction.astype(np.float32)
+        )
+        met = triangle >= 0
+        ranges[met] = reach[met]
+        across = normal[met].astype(np.float64)
+        along = np.abs((across * direction[met]).sum(axis=1))
+        cosine[met] = np.minimum(along / np.linalg.norm(across, axis=1), 1.0)
+        material[met] = self._material[triangle[met]]
+        return ranges, cosine, material

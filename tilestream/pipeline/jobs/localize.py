@@ -12,6 +12,7 @@ import pandas as pd
 from tilestream.config import RegistrationSettings, StartSettings
 from tilestream.errors import PartialError, TileNotReadyError, UsageError
 from tilestream.formats.mcap import ScanLog, ScanSelection
+from tilestream.kernels.fixed_order import norms
 from tilestream.localization import start_poses
 from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.outputs import Parquet
@@ -166,7 +167,7 @@ def choose_samples(log: ScanLog, scans: ScanSelection, spacing: float) -> tuple[
     chosen = chosen[log.posed[chosen]]
     if not len(chosen):
         raise UsageError(f"{log.path}: no scan with a pose is selected; {len(log)} scans are there")
-    steps = np.linalg.norm(np.diff(log.T_map_lidar[chosen, :3, 3], axis=0), axis=1)
+    steps = norms(np.diff(log.T_map_lidar[chosen, :3, 3], axis=0))
     arc = np.concatenate([[0.0], np.cumsum(steps)])
     places = np.arange(0.0, arc[-1] + 0.5 * spacing, spacing)
     after = np.clip(np.searchsorted(arc, places), 1, max(1, len(arc) - 1))

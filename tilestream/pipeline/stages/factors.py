@@ -54,7 +54,8 @@ def factors(map_part: MapPart, samples: Samples, looking: Looking) -> Made:
     positions = frame[["x", "y", "z"]].to_numpy()
     cache = _cache(map_part.store_url, looking.cell_size, map_part.state)
     found = factors_of(store, positions, looking.sensor, looking.cell_size, looking.which, cache)
-    return Made(pd.concat([frame, found], axis=1), {"data_set": canonical(looking)})
+    facts = {"data_set": canonical(looking), "store": store.address}
+    return Made(pd.concat([frame, found], axis=1), facts)
 
 
 @lru_cache(maxsize=1)

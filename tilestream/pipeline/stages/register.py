@@ -10,6 +10,7 @@ import pandas as pd
 
 from tilestream.config import RegistrationSettings, StartSettings
 from tilestream.errors import PoseError, RegistrationError, UsageError
+from tilestream.kernels.fixed_order import norms
 from tilestream.localization import FINE_CELL, refined_pose, start_errors, start_poses
 from tilestream.localization import register as register_scan
 from tilestream.marks import canonical
@@ -114,7 +115,8 @@ def register(
             facts[str(sample.number)] = _place(T_map_true) | {"points": points, "reason": ""}
     names = {column.name: column.dtype for column in START_COLUMNS}
     frame = pd.concat(rows, ignore_index=True)[list(names)].astype(names)
-    return Made(frame, {"samples": facts, "data_set": canonical(measuring)})
+    known = {"data_set": canonical(measuring), "store": map_part.store.address}
+    return Made(frame, {"samples": facts, **known})
 
 
 def _registered(
@@ -130,7 +132,7 @@ def _registered(
     found = register_scan(cells, scan.points, starts, measuring.registration)
     rows = {
         "start": np.arange(*batch),
-        "distance": np.linalg.norm(starts[:, :3, 3] - T_map_true[:3, 3], axis=1),
+        "distance": norms(starts[:, :3, 3] - T_map_true[:3, 3]),
         **start_errors(T_map_true, found.T_map_lidar),
         **{name: getattr(found, name) for name in ("converged", "iterations", "score", "nvtl")},
         "hits": found.hits,
@@ -154,7 +156,7 @@ def _true_pose(map_part: MapPart, scan: Scan, measuring: Measuring) -> Float64:
 
 def _cells_around(map_part: MapPart, scan: Scan, T_map_lidar: Float64, cell_size: float) -> Cells:
     """The cells of the tiles in reach of a scan."""
-    ranges = np.linalg.norm(scan.points[:, :2], axis=1)
+    ranges = norms(scan.points[:, :2])
     reach = (float(ranges.max()) if ranges.size else 0.0) + MARGIN
     store = map_part.store
     keys = tuple(store.grid.keys_over(Box.around(T_map_lidar[None, :2, 3], reach)))

@@ -1,0 +1,59 @@
+"""The command that shows a map in 3D, and the legend of its colours."""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.text import Text
+
+from tilestream.apps.scene import MOST_POINTS, Scene, scene_of
+from tilestream.apps.view import require_display, show
+from tilestream.cli.printing import out
+from tilestream.report.colours import STEPS, palette
+from tilestream.tiling import TileKey
+
+RAMP = 24
+"""Characters of the legend's ramp of colours."""
+
+
+def view(
+    place: Annotated[
+        str, typer.Argument(help="A tile store, or a run directory: `run`, `localize`, `factors`.")
+    ],
+    tile: Annotated[
+        str | None, typer.Option(help="Only this tile, as `status` names it, e.g. 12_-3.")
+    ] = None,
+    screenshot: Annotated[
+        Path | None, typer.Option(help="Write this PNG instead of opening a window.")
+    ] = None,
+    points: Annotated[
+        int, typer.Option(min=1, help="Of a larger map, show a sample of so many points.")
+    ] = MOST_POINTS,
+) -> None:
+    """Show a map in 3D, the route on it coloured by measured or estimated error."""
+    key = None if tile is None else TileKey.parse(tile)
+    require_display(screenshot)
+    scene = scene_of(place, tile=key, points=points)
+    for line in legend(scene):
+        out.print(line, soft_wrap=True, highlight=False)
+    if screenshot is None:
+        out.print("Drag to turn, wheel to zoom, + and - to size the points, Q to close.")
+    show(scene, screenshot)
+
+
+def legend(scene: Scene) -> list[Text]:
+    """What the points are, and what the colours of the places mean."""
+    low, high = scene.height_range
+    told = f"map: {len(scene.points):,} of {scene.total:,} points of {len(scene.tiles):,} tiles, "
+    lines = [Text(told + f"from dark at {low:.1f} m to bright at {high:.1f} m")]
+    measured, known = scene.measured.sum(), np.isfinite(scene.error).sum()
+    if len(scene.places):
+        told = f"route: {measured:,} places measured (large), {known - measured:,} estimated "
+        lines.append(Text(told + f"(small), {len(scene.places) - known:,} neither (grey)"))
+    if known:
+        colours = palette()[:: STEPS // RAMP]
+        ramp = [("█", colour) for colour in colours]
+        ends = (f"{end * 100.0:.1f} cm" for end in (scene.scale.low, scene.scale.high))
+        lines.append(Text.assemble(f"error: {next(ends)} ", *ramp, f" {next(ends)} and more"))
+    return lines

@@ -1,0 +1,103 @@
+"""Where compiled kernels are kept: in a folder that nobody else can write, or nowhere.
+
+Compiling takes minutes, so Numba keeps the result on disk, as pickles: whoever can write the folder
+runs code as its reader. Numba does not look who can, and refuses to start where it finds no folder.
+So a place is chosen once for a process, before its first kernel is decorated.
+"""
+
+import logging
+import multiprocessing
+import os
+import stat
+import sys
+import tempfile
+from functools import partial
+from pathlib import Path
+
+import numba
+
+if sys.platform != "win32":
+    import grp
+    import pwd
+
+logger = logging.getLogger(__name__)
+
+
+def _is_own(group: int) -> bool:
+    """Whether a group is this user's alone: of the same name, as most Linux systems make one."""
+    try:
+        user, named = pwd.getpwuid(os.getuid()).pw_name, grp.getgrgid(group)
+    except KeyError:
+        return False
+    return named.gr_name == user and set(named.gr_mem) <= {user}
+
+
+def _others_write(folder: Path) -> bool:
+    """Whether a user other than this one and root can put files into a folder.
+
+    Never on Windows, where its mode does not tell, and where profile and temporary folder are of
+    one user.
+    """
+    if sys.platform == "win32":
+        return False
+    status = folder.stat()
+    by_group = status.st_mode & stat.S_IWGRP and not _is_own(status.st_gid)
+    return bool(status.st_uid not in (0, os.getuid()) or status.st_mode & stat.S_IWOTH or by_group)
+
+
+def _of_numba() -> Path | None:
+    """The folder in which Numba would keep the kernels of this package; None: it finds none."""
+
+    def kernel() -> None:
+        """Of this folder, as all kernels are."""
+
+    try:
+        folder = Path(str(numba.njit(cache=True)(kernel).stats.cache_path))
+    except RuntimeError:  # "no locator available"
+        return None
+    # a home that nobody knows stays `~`: a folder wherever the process was started
+    return None if folder.parts[0] == "~" else folder.resolve()
+
+
+def _temporary() -> Path | None:
+    """A folder of this user alone below the one for temporary files; None where it is not safe."""
+    user = "" if sys.platform == "win32" else f"-{os.getuid()}"
+    try:
+        folder = Path(tempfile.gettempdir(), f"tilestream-numba{user}")
+        folder.mkdir(mode=0o700, exist_ok=True)
+    except OSError:
+        return None
+    safe = not folder.is_symlink() and not _others_write(folder) and os.access(folder, os.W_OK)
+    return folder if safe else None
+
+
+def _settle() -> bool:
+    """Point Numba to a safe folder, and say so where it is not Numba's own choice.
+
+    Returns:
+        Whether there is one. `NUMBA_CACHE_DIR` holds it for the processes that this one starts.
+    """
+    if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
+        return False
+    folder = _of_numba()
+    if folder is None:
+        reason = "Numba finds no folder for them"
+    elif _others_write(folder) or _others_write(folder.parent):
+        reason = f"others can write {folder}, and would run code here"
+    else:
+        return True
+    other = _temporary()
+    if other is not None:
+        os.environ["NUMBA_CACHE_DIR"] = str(other)
+        numba.config.reload_config()  # type: ignore[no-untyped-call]
+    if multiprocessing.current_process().name == "MainProcess":  # or every worker would say it
+        logger.warning(
+            "kernels are %s: %s; set NUMBA_CACHE_DIR to a folder that only you can write",
+            "compiled by every process anew" if other is None else f"cached in {other}",
+            reason,
+        )
+    return other is not None
+
+
+njit = partial(numba.njit, cache=_settle())
+"""Numba's decorator for every kernel of this package."""

@@ -1,0 +1,47 @@
+"""A run directory from outside: its tables, and the map that they were made from."""
+
+import os
+from pathlib import Path
+
+import pandas as pd
+
+from tilestream.errors import StoreNotFoundError
+from tilestream.store import TileStore, open_store
+from tilestream.tables import read_mark, read_tables
+
+
+def map_of(place: str | os.PathLike[str]) -> TileStore:
+    """The map of a run directory: its own `map.zarr`, else the store that its tables name.
+
+    Args:
+        place: a run directory of any job, or a tile store itself (a path or an fsspec URL).
+
+    Raises:
+        StoreNotFoundError: nothing there, or the map has moved; says how to name its new place.
+        StoreError: something else lies there.
+    """
+    inside = Path(place) / "map.zarr"
+    if inside.is_dir():
+        return open_store(str(inside))
+    made_from_it = [*table_paths(place, "starts"), *table_paths(place, "factors")]
+    if not made_from_it:
+        return open_store(os.fspath(place))
+    named = read_mark(made_from_it[0]).facts.get("store", str(inside))
+    try:
+        return open_store(named)
+    except StoreNotFoundError as error:
+        raise StoreNotFoundError(
+            f"{error}; if the map of {place} is elsewhere now, link {inside} to it"
+        ) from None
+
+
+def rows_of(place: str | os.PathLike[str], table: str) -> pd.DataFrame | None:
+    """The rows of a table of a run directory, e.g. `predictions`; None where it has none."""
+    paths = table_paths(place, table)
+    return read_tables(paths) if paths else None
+
+
+def table_paths(place: str | os.PathLike[str], table: str) -> list[str]:
+    """The files of a table of a run directory, sorted: of the main job, or of a command alone."""
+    folders = (Path(place) / "tables" / table, Path(place) / table)
+    return sorted(str(path) for folder in folders for path in folder.rglob("*.parquet"))
