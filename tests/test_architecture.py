@@ -20,6 +20,7 @@ FLOORS = (
     ("factors", "forest"),
     ("report", "ingest"),
     ("dataflow",),
+    ("definitions",),
     ("cli",),
     ("__init__", "__main__"),
 )

@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from tilestream.dataflow.main_job import dataset as dataset
     from tilestream.dataflow.main_job import run as run
     from tilestream.dataflow.run_settings import RunSettings as RunSettings
+    from tilestream.definitions import explain as explain
 
 
 def __getattr__(name: str) -> Any:
@@ -54,6 +55,8 @@ def __getattr__(name: str) -> Any:
     """
     if name in ("run", "dataset"):
         return getattr(import_module("tilestream.dataflow.main_job"), name)
+    if name == "explain":
+        return import_module("tilestream.definitions").explain
     if name == "RunSettings":
         return import_module("tilestream.dataflow.run_settings").RunSettings
     raise AttributeError(f"module 'tilestream' has no attribute {name!r}")

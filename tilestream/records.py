@@ -217,7 +217,8 @@ class Column:
     source: str
     """The formula, and where it comes from: `eq. 4`, `definitions, section 4`, …"""
     factor_set: Literal["faithful", "robust", "observability"] = "faithful"
-    """The paper's own, or a twin that is not degenerate (definitions, sections 3 and 4)."""
+    """The paper's own, or a twin that is not degenerate (definitions, section 3 and
+    definitions, section 4)."""
     dtype: str = "float64"
     """Type of its values."""
 

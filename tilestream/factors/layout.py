@@ -1,8 +1,8 @@
 """Layout of the features: how they stand around the sample point (the paper, section V.C).
 
-The robust twins mend what the paper's factors lose (definitions, section 4): `FDOP` is a distance,
-so true dilutions of precision stand beside it; flat ground alone fills `normal_H_90` with noise and
-a wall's normal straddles two of its rows, so walls are told apart by their axis only.
+The robust twins mend what the paper's factors lose (definitions, section 4.1). `FDOP` is a
+distance, so true dilutions of precision stand beside it. Flat ground alone fills `normal_H_90` with
+noise, and a wall's normal straddles two of its rows, so walls are told apart by their axis only.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ WALL_WEIGHTS = (1, 2, 3, 2, 1)
 """How much of a bin of wall directions goes to the bins around it."""
 SINGULAR = 1e-6
 """Directions whose least mean square share is below this do not span space."""
-_SECTIONS = "definitions, section 4: "
+_SECTIONS = "definitions, section 4.1: "
 
 COLUMNS = (
     Column(

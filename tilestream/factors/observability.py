@@ -50,7 +50,7 @@ Row = dict[str, object]
 """A row of the table by column, without what is missing."""
 
 
-def _column(name: str, unit: str, meaning: str, source: str = "definitions, section 4") -> Column:
+def _column(name: str, unit: str, meaning: str, source: str = "definitions, section 4.4") -> Column:
     return Column(name, "OB", unit, meaning, source, "observability")
 
 
@@ -74,7 +74,9 @@ VIEW_COLUMNS = (
     _column("ob_score", "1", "Expected score at the sample point, mean per scan point.", "eq. 12"),
     _column("ob_nvtl", "1", "Expected NVTL at the sample point.", "Autoware"),
     _column("ob_points", "1", "Points of the virtual scan after thinning."),
-    _column("ob_cells", "1", "Cells whose voxels these points hit."),
+    _column(
+        "ob_cells", "1", "Cells whose voxels the points of the virtual scan hit, before thinning."
+    ),
     _column("ob_returns", "1", "Share of the beams that come back."),
     _column("ob_unmapped", "1", "Share of the beams that meet nothing and leave the mapped area."),
     _column("ob_ghosts", "1", "Share of the beams that traffic in the map would stop, left out."),

@@ -22,7 +22,13 @@ PLACE_COLUMNS = (
     Column("heading", "place", "rad", "Direction of travel, from the map's x axis.", ""),
     Column("x", "place", "m", "Place of the lidar.", "definitions, section 2"),
     Column("y", "place", "m", "Place of the lidar.", "definitions, section 2"),
-    Column("z", "place", "m", "Place of the lidar: route or ground, plus its height.", "section 2"),
+    Column(
+        "z",
+        "place",
+        "m",
+        "Place of the lidar: route or ground, plus its height.",
+        "definitions, section 2",
+    ),
 )
 STATUS_COLUMNS = (
     Column("status", "place", "", "done, missing or failed.", "", dtype="str"),

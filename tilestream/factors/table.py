@@ -115,7 +115,7 @@ def factors(
     which: Which = "faithful",
     cache: TermsCache | None = None,
 ) -> pd.DataFrame:
-    """The factors of the definitions, sections 3 and 4, at sample points of a map.
+    """The factors (definitions, section 3 and definitions, section 4.1) at sample points of a map.
 
     Args:
         store: the map.

@@ -1,7 +1,8 @@
 """What a sample point sees: terms of cells as whole numbers, and their sums over vicinities.
 
-Definitions, section 2. Every sum is a sum of integers (counts, or fixed point), so that it is the
-same bits for any tiling, any order of tiles and sample points, and any number of workers.
+The vicinity is that of definitions, section 2. Every sum is a sum of integers (definitions,
+section 1.2), so it has the same bits for any tiling, any order of tiles and sample points, and any
+number of workers.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -204,7 +205,8 @@ def _blocks(points: Float64, edge: float) -> tuple[Float64, Int64, Float64]:
 def row_edges(sensor: Sensor) -> Float64:
     """Elevations of the edges of the depth image's rows [rad], rising; a row per beam.
 
-    Halfway between beams, the outer ones mirrored at the outer beams (definitions, factor 8).
+    Halfway between beams, the outer ones mirrored at the outer beams (definitions, section 3,
+    `occupancy_ratio`).
     """
     beams = np.radians(sensor.elevations_deg)
     between = (beams[:-1] + beams[1:]) / 2.0
@@ -213,7 +215,7 @@ def row_edges(sensor: Sensor) -> Float64:
 
 
 def _row_sines(sensor: Sensor) -> Float64:
-    """Sines of the rows' edges, each moved by 1e-9 of its row ("bins and ties")."""
+    """Sines of the rows' edges, each moved by 1e-9 of its row (definitions, section 1.1)."""
     edges = row_edges(sensor)
     height = np.diff(edges)
     moved = np.append(edges[:-1] - 1e-9 * height, edges[-1] + 1e-9 * height[-1])

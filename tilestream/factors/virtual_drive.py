@@ -23,7 +23,7 @@ GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 """Turn from one start to the next, so that any number of them is spread evenly [rad]."""
 
 
-def _column(name: str, unit: str, meaning: str, source: str = "definitions, section 5") -> Column:
+def _column(name: str, unit: str, meaning: str, source: str = "definitions, section 4.5") -> Column:
     return Column(name, "OB", unit, meaning, source, "observability")
 
 

@@ -1,4 +1,4 @@
-"""The bin of an azimuth on the full circle, as definitions, section 1, "bins and ties" wants it."""
+"""The bin of an azimuth on the full circle, as definitions, section 1.1, wants it."""
 
 import numpy as np
 from numba import njit

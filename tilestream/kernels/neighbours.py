@@ -1,4 +1,4 @@
-"""Which cells are near which, as lists: the neighbours of definitions, section 3, and others."""
+"""Which cells are near which, as lists: the neighbours of definitions, section 3.1, and others."""
 
 import numpy as np
 from numba import njit

@@ -1,4 +1,4 @@
-"""One Newton step of the registration: gradient, Hessian and the two solvers of definitions, 5.
+"""One Newton step of the registration: gradient, Hessian, two solvers (definitions, section 5.1).
 
 A step is (tau, w) [m, rad]: t <- t + tau, R <- Exp(w) R, about the scan's origin. A scan point
 r = R p moves by J = [I, -[r]_x]. With f = B q (q from the cell's mean to the point, B the inverse

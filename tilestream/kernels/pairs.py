@@ -68,7 +68,7 @@ def pfh_counts(
     start: NDArray[np.int64],
     near: NDArray[np.int32],
 ) -> NDArray[np.int32]:
-    """Pairs per bin over all unordered pairs of {cell + its neighbours} (definitions, section 3).
+    """Pairs per bin over all unordered pairs of {cell + its neighbours} (definitions, section 3.1).
 
     A pair (i, j) counts for every cell c that has both in its set, and c then is in the sets of
     both: so for each i, walk the c in its set, and the j > i in theirs.

@@ -1,4 +1,5 @@
-"""3D-NDT registration of a scan from many starts: Newton steps until one is short (definitions, 5).
+"""3D-NDT registration of a scan from many starts: Newton steps until one is short (definitions,
+section 5.1).
 
 What a start ends with does not depend on the starts before it: slots either hold what an anchor
 alone decides, or are forgotten before a start.

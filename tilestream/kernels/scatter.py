@@ -1,6 +1,6 @@
 """Points to whole millimetres, and to the tiles that own them.
 
-The lattice is that of the definitions, section 1: floor division of millimetres.
+The lattice is that of definitions, section 1: floor division of millimetres.
 """
 
 import numba

@@ -435,7 +435,8 @@ def score_sums(
     d1: float,
     d2: float,
 ) -> NDArray[np.float64]:
-    """Sum over a cell's points x of -d1 p(x + v; c*) for the 441 shifts v (definitions, no. 17).
+    """Sum over a cell's points x of -d1 p(x + v; c*) for the 441 shifts v (definitions,
+    section 3, `score_H`).
 
     p(y; c) = exp(-d2/2 (y - mu)^T Sigma'^-1 (y - mu)); c* is the cell whose mean is nearest to
     x + v, of means within 1e-9 m the lexicographically first; none within l gives 0.

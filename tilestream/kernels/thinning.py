@@ -1,6 +1,6 @@
 """Points in the order of their lattice voxels, and one point per voxel: the unweighted centroid.
 
-definitions, section 1, "map points": integer sum / count, rounded to 1 mm (half to even), so that
+Map points (definitions, section 1): integer sum / count, rounded to 1 mm (half to even), so that
 the result depends neither on the order nor on the blocks in which the points arrive.
 """
 
