@@ -1,7 +1,8 @@
-"""The surfels of a map, tile by tile: what a virtual scan sees instead of points.
+"""The surfels of a map, tile by tile: a virtual scan is cast at them instead of points.
 
-One per voxel of 0.2 m that holds map points (a coarser map: per voxel of its leaf): the plane of
-the points around it as a small disc, or a ball where they make no plane.
+One per voxel of 0.2 m that holds map points, or per voxel of the map's leaf where that is larger: a
+small disc in the plane of the points around it, or a ball where they form no plane (definitions,
+section 4.2).
 """
 
 from collections.abc import Mapping
@@ -23,12 +24,12 @@ SURFELS_VERSION = 1
 FINEST_MM = 200
 """Smallest edge of the voxels of surfels [mm]."""
 REACH_EDGES = 4
-"""How far around its voxel the points that decide a surfel can lie, with their voxels [edges]."""
+"""How far from its voxel the points that a surfel depends on can lie, with their voxels [edges]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Surfels:
-    """Discs and balls that stand for the points of a map."""
+    """Discs and balls that represent the points of a map."""
 
     centre_mm: Int64
     """(n, 3) centres [mm, map frame], in the order of their voxels."""
@@ -41,7 +42,7 @@ class Surfels:
         return len(self.centre_mm)
 
     def where(self, chosen: NDArray[np.bool_]) -> Self:
-        """Some of them."""
+        """The surfels where `chosen` (n,) is True."""
         return type(self)(self.centre_mm[chosen], self.normal[chosen], self.radius_mm[chosen])
 
 
@@ -56,7 +57,7 @@ def surfels_table(edge_mm: int) -> str:
 
 
 def around_tile(store: TileStore, key: TileKey) -> Box:
-    """The box of all points that the surfels of a tile depend on."""
+    """The box [mm] of all points that the surfels of a tile depend on."""
     return store.grid.core(key).grown(REACH_EDGES * surfel_mm(store))
 
 
@@ -83,7 +84,7 @@ def surfels_mark(store: TileStore, key: TileKey) -> Mark:
 
 
 def tile_surfels(store: TileStore, key: TileKey) -> Surfels:
-    """The surfels of the voxels whose lowest corners a tile owns: the same for any tiling.
+    """The surfels of the voxels whose lowest corners lie in a tile: the same for any tiling.
 
     Raises:
         TileNotReadyError: the tile, or a neighbour that exists, is not done; says why.
@@ -96,7 +97,7 @@ def tile_surfels(store: TileStore, key: TileKey) -> Surfels:
 
 
 def surfel_columns(store: TileStore, key: TileKey, surfels: Surfels) -> dict[str, NDArray[Any]]:
-    """What the store keeps of a tile's surfels: an array per column, small numbers."""
+    """A tile's surfels as the store keeps them: arrays by name, relative to the tile's origin."""
     origin = np.array(store.grid.origin_mm(key), np.int64)
     return {
         "centre": np.ascontiguousarray((surfels.centre_mm - origin).T.astype(np.int32)),
@@ -146,8 +147,8 @@ def points_in(store: TileStore, box: Box, key: TileKey | None = None) -> Int64:
 
     Args:
         store: the map.
-        box: where; tiles that the store does not have are empty ground …
-        key: … but for this one, which must be there.
+        box: where [mm]; tiles that the store does not have count as empty …
+        key: … except this one, which must be there.
 
     Raises:
         TileNotReadyError: a tile in the box failed or was skipped; says why.

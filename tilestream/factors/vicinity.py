@@ -1,4 +1,4 @@
-"""What a sample point sees: terms of cells as whole numbers, and their sums over vicinities.
+"""Vicinities of sample points: terms of cells as whole numbers, and their sums.
 
 The vicinity is that of definitions, section 2. Every sum is a sum of integers (definitions,
 section 1.2), so it has the same bits for any tiling, any order of tiles and sample points, and any
@@ -32,7 +32,7 @@ HISTOGRAMS = {"normal_8": 8 * 8, "normal_16": 16 * 16, "normal_90": 90 * 90, "wa
 STANDING = "standing"
 """The term that says whether a cell's normal is not vertical: its azimuth is counted apart."""
 CELL_BLOCK = 16.0
-"""Edge of the blocks of cells that are looked at together [m]; only speed depends on it."""
+"""Edge of the blocks in which cells are tested together [m]; only speed depends on it."""
 POINT_BLOCK, POINT_GROUP = 2.5, 4
 """Edge of the blocks of points of the depth image [m], and of groups of them in blocks."""
 
@@ -132,19 +132,19 @@ class TileTerms:
         )
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """What the store keeps: an array per field."""
+        """The fields as arrays, as the store keeps them."""
         kept = {f.name: getattr(self, f.name) for f in fields(self)}
         return {**kept, "names": np.frombuffer("\n".join(self.names).encode(), np.uint8)}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Self:
-        """The terms that `arrays` gave."""
+        """The terms from the arrays that `arrays` gave."""
         names = arrays["names"].astype(np.uint8).tobytes().decode().split("\n")
         return cls(**{**arrays, "names": tuple(names)})  # type: ignore[arg-type]
 
     @property
     def nbytes(self) -> int:
-        """Memory that the arrays take, with what is made from them [bytes]."""
+        """Memory of the arrays, with those that are derived from them [bytes]."""
         kept = sum(array.nbytes for array in self.arrays().values())
         return kept + self.mean.nbytes + self.depth_mm.nbytes + self.bins.nbytes * 2
 
