@@ -1,9 +1,9 @@
 """LZF, the compression of binary_compressed PCD files (Marc Lehmann's liblzf stream format).
 
-A stream is a sequence of instructions. A first byte c < 32 is a literal: copy the c + 1 bytes
-behind it. Any other is a back reference: length (c >> 5) + 2, where 7 in the three bits means that
-a further byte is added to the length; distance ((c & 31) << 8 | last byte) + 1 back from the end of
-the output, which it may overlap.
+A stream is a row of instructions. A first byte c < 32 is a literal: copy the c + 1 bytes behind it.
+Any other is a back reference: length (c >> 5) + 2, where 7 in the three bits means that a further
+byte is added to the length; distance ((c & 31) << 8 | last byte) + 1 back from the end of the
+output, which it may overlap.
 """
 
 import numpy as np
@@ -69,7 +69,7 @@ def decompress(packed: NDArray[np.uint8], unpacked: NDArray[np.uint8]) -> int:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def compress(raw: NDArray[np.uint8], packed: NDArray[np.uint8]) -> int:
-    """Encode `raw` into `packed`; a hash table holds the last position of every three bytes.
+    """Encode `raw` into `packed` by a hash of the last place of every three bytes.
 
     Args:
         raw: (n,) contiguous.
