@@ -23,6 +23,7 @@ FLOORS = (
     ("pipeline.stages",),
     ("pipeline.jobs",),
     ("apps",),
+    ("definitions",),
     ("cli",),
     ("__init__", "__main__", "pipeline.__init__"),
 )

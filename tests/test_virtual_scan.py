@@ -22,8 +22,8 @@ from tilestream.factors.virtual_scan import (
     Scene,
     VirtualScan,
     VirtualSettings,
-    crowded,
     draws,
+    near_share,
     probability,
     virtual_scan,
 )
@@ -421,4 +421,4 @@ def test_a_place_in_a_wall_is_crowded_and_one_beside_it_is_not() -> None:
     for x, low, high in ((30, 0.4, 0.6), (2000, 0.0, 0.0)):
         place = np.array([x, 0, 0])
         scene = Scene.of(surfels_from(points), place[None], EDGE)
-        assert low <= crowded(scene, place, beams, 0.9) <= high
+        assert low <= near_share(scene, place, beams, 0.9) <= high

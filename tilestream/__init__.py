@@ -44,6 +44,7 @@ from tilestream.version import VERSION
 
 if TYPE_CHECKING:
     from tilestream.apps.view import view as view
+    from tilestream.definitions import explain as explain
     from tilestream.pipeline.jobs.run import dataset as dataset
     from tilestream.pipeline.jobs.run import run as run
     from tilestream.pipeline.jobs.run_settings import RunSettings as RunSettings
@@ -57,6 +58,8 @@ def __getattr__(name: str) -> Any:
         return getattr(import_module("tilestream.pipeline.jobs.run"), name)
     if name == "view":
         return import_module("tilestream.apps.view").view
+    if name == "explain":
+        return import_module("tilestream.definitions").explain
     if name == "RunSettings":
         return import_module("tilestream.pipeline.jobs.run_settings").RunSettings
     raise AttributeError(f"module 'tilestream' has no attribute {name!r}")

@@ -1,4 +1,8 @@
-"""Settings: frozen pydantic models; a unit and a meaning per field; unknown keys refused."""
+"""Settings: frozen pydantic models; unknown keys refused.
+
+The docstring of a field is its documentation: meaning, and the unit in brackets. `tilestream
+explain` prints it.
+"""
 
 import difflib
 import re
@@ -20,7 +24,9 @@ class Settings(BaseModel):
         UsageError: a value that cannot be; names each key and what is wrong with it.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
+    )
 
     def __init__(self, **values: Any) -> None:
         try:
@@ -60,7 +66,7 @@ class IngestSettings(Settings):
 
 
 class RegistrationSettings(Settings):
-    """The matcher: 3D-NDT as definitions, section 5, fixes it. It decides the label."""
+    """The matcher: 3D-NDT as definitions, section 5.1, fixes it. It decides the label."""
 
     neighbours: Literal["direct1", "direct7", "radius"] = "direct7"
     """Cells that score a scan point: that of its own voxel, also the six that share a face (Koide,

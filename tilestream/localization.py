@@ -1,7 +1,7 @@
 """Registration of a scan in the map, and how far it ends from the truth (definitions, section 5).
 
-A scan is thinned, the cells around it become a local map, every start steps on it until it rests;
-the label of a place is what 317 starts around the true pose end with.
+A scan is thinned, the cells around it become a local map, and from every start Newton steps are
+taken until one is short. The label of a place is the error of 317 starts around the true pose.
 """
 
 import logging
@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from tilestream.config import RegistrationSettings, StartSettings
 from tilestream.errors import RegistrationError, UsageError
-from tilestream.kernels.anchors import neighbour_lists
 from tilestream.kernels.density import magnusson_constants
 from tilestream.kernels.fixed_order import norms
+from tilestream.kernels.neighbour_lists import neighbour_lists
 from tilestream.kernels.registration import Aligned, LocalMap, Rule, align
 from tilestream.kernels.slots import empty_slots
 from tilestream.records import Cells, Float64, Int64, LocalizationError, Registrations, TruePose
@@ -28,8 +28,8 @@ LARGEST_SCAN = 10_000.0
 """Largest distance of a scan point from the lidar [m]; a farther one is in another frame."""
 RIGID = 1e-4
 """How far R^T R of a start may be from the identity: poses are often written with 6 digits."""
-MAX_ANCHORS = 2**27
-"""Largest dense grid around a scan: half a gigabyte of lists' beginnings."""
+MAX_BUCKETS = 2**27
+"""Most buckets of the dense grid around a scan: 4 bytes each, half a gigabyte."""
 FAILED = 0.5
 """3D error beyond which a start has failed [m]."""
 NEAR = 1.0
@@ -45,8 +45,7 @@ _log = logging.getLogger(__name__)
 def disc_starts(radius: float = 2.0, step: float = 0.2) -> Float64:
     """Offsets (i, j) * step with i^2 + j^2 <= (radius / step)^2, i slowest: the paper's particles.
 
-    Decided in whole millimetres, i^2 + j^2 in whole numbers of steps: exactly 317 by default,
-    where floats would lose some.
+    Compared in whole millimetres: exactly 317 by default, where floats would lose some.
 
     Args:
         radius: radius of the disc [m], whole millimetres.
@@ -105,12 +104,12 @@ def register(
 ) -> Registrations:
     """Register a scan in the map by 3D-NDT from every start.
 
-    The result of a start is the same to the bit on every run, in whatever company and order of
-    starts, and in whatever order the scan's points come.
+    The result of a start has the same bits on every run, whatever the other starts, their order and
+    the order of the scan's points.
 
     Args:
-        cells: cells of the map that cover what the scan sees from the starts, and 3 m more (the
-            way that a start can go); others are ignored.
+        cells: cells of the map that cover the scan from every start, and 3 m more (how far the
+            steps of a start can lead); others are ignored.
         scan_points: (n, 3) points in the lidar frame [m], finite. Thinned to `settings.scan_leaf`.
         T_map_lidar_starts: (k, 4, 4) start poses, or one (4, 4).
         settings: the matcher; default `RegistrationSettings()`.
@@ -172,7 +171,7 @@ def localization_error(
         scan_points: (n, 3) points in the lidar frame [m].
         T_map_lidar: (4, 4) true pose of the lidar.
         starts: (k, 2) offsets in map x and y [m] at true z and orientation, or (k, 4, 4) poses;
-            None: those of `start_settings`.
+            None: the starts of `start_settings`.
         settings: the matcher; default `RegistrationSettings()`.
         start_settings: the starts; default the paper's 317.
         true_pose: where `T_map_lidar` is from; recorded.
@@ -201,7 +200,7 @@ def start_errors(T_map_true: Float64, T_map_final: Float64) -> dict[str, Any]:
 
     Args:
         T_map_true: (4, 4) true pose.
-        T_map_final: (k, 4, 4) where the starts ended.
+        T_map_final: (k, 4, 4) final poses of the starts.
 
     Returns:
         (k,) each: `along`, `across`, `up` [m], `yaw` [rad], `error` (the 3D norm) [m], as the
@@ -255,7 +254,8 @@ def refined_pose(
 
     Register from the log's pose; then the best direct7 score over the 0.05 m lattice in map x and
     y within 0.5 m of where that ended, at its z and orientation (equal scores: the first, x
-    slowest). It shares its scan with what it judges: pass `true_pose="refined"` on.
+    slowest). The refined pose shares its scan with the registrations that it is the reference for:
+    pass `true_pose="refined"` on.
 
     Args:
         fine_cells: cells of 1.0 m around the scan.
@@ -289,7 +289,11 @@ def refined_pose(
 
 
 def _scan(scan_points: ArrayLike) -> Float64:
-    """The scan's points, refused if they are none."""
+    """(n, 3) the scan's points as float64 [m], checked.
+
+    Raises:
+        RegistrationError: another shape, too few, not finite, or too far away.
+    """
     points = np.asarray(scan_points)
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "iuf":
         raise RegistrationError(
@@ -316,8 +320,8 @@ def _scan(scan_points: ArrayLike) -> Float64:
 def _thinned(points: Float64, leaf: float) -> Float64:
     """The centroid of each voxel of the lidar frame's lattice, by voxel index; leaf 0: as given.
 
-    Sums are fixed point, 2^-30 m: the order of the points does not show. Neither does it with
-    leaf 0, where the points are only sorted.
+    Sums are fixed point (2^-30 m), so the order of the points has no effect. With leaf 0 the points
+    are only sorted.
     """
     leaf = whole_mm(leaf, "scan_leaf") / MM_PER_M
     if leaf == 0.0:
@@ -339,7 +343,7 @@ def _thinned(points: Float64, leaf: float) -> Float64:
 
 
 def _rigid(T: ArrayLike, name: str) -> Float64:
-    """Poses (k, 4, 4) as float64, refused unless all are rigid and finite."""
+    """Poses (k, 4, 4) as float64; RegistrationError unless all are rigid and finite."""
     poses = np.asarray(T)
     if poses.dtype.kind not in "iuf" or poses.shape[-2:] != (4, 4) or poses.ndim not in (2, 3):
         raise RegistrationError(f"{name}: shape {poses.shape}, give (k, 4, 4) poses or one (4, 4)")
@@ -363,7 +367,7 @@ def _rigid(T: ArrayLike, name: str) -> Float64:
 def _starts(
     T_map_true: Float64, starts: ArrayLike | None, settings: StartSettings | None
 ) -> Float64:
-    """The start poses that the arguments of `localization_error` mean."""
+    """(k, 4, 4) start poses from the arguments of `localization_error`."""
     if starts is None:
         return start_poses(T_map_true, settings)
     if settings is not None:
@@ -383,9 +387,8 @@ def _starts(
 def _local_map(
     cells: Cells, points: Float64, starts: Float64, settings: RegistrationSettings
 ) -> tuple[LocalMap, Int64]:
-    """The cells that the scan can come near from the starts, on a dense grid.
-
-    And the grid's origin [anchors of the map's lattice].
+    """The cells that the scan can reach from the starts, on a dense grid, and the grid's origin
+    [buckets of the map's lattice].
     """
     size = cells.cell_size
     halves, span = (2, 3) if settings.neighbours == "radius" else (1, 1)
@@ -394,7 +397,7 @@ def _local_map(
     index, mean = cells.index[near], cells.mean[near]
     low = index.min(axis=0) * halves - span - 1
     shape = index.max(axis=0) * halves - low + span + 2
-    if math.prod(shape.tolist()) > MAX_ANCHORS:
+    if math.prod(shape.tolist()) > MAX_BUCKETS:
         raise RegistrationError(
             f"the scan and its starts span {shape} voxels of {size / halves:g} m: "
             "register fewer starts at once, or use larger cells"
@@ -415,7 +418,9 @@ def _local_map(
 def _near(
     cells: Cells, points: Float64, starts: Float64, settings: RegistrationSettings
 ) -> NDArray[np.intp]:
-    """Rows of the cells in the box that the scan can reach: its radius and the longest way."""
+    """Rows of the cells in the box that the scan can reach: its radius and the longest path of a
+    start.
+    """
     steps = settings.iterations_max * max(settings.step_max, settings.epsilon)
     way = float(norms(points).max()) + steps + 2.0 * cells.cell_size
     where = starts[:, :3, 3]
@@ -460,7 +465,7 @@ def _nothing_yet(R: Float64, t: Float64) -> Aligned:
 
 
 def _require_hits(hits: Int64, starts: Float64) -> None:
-    """A start without a hit has nothing to step on, and none to stop at."""
+    """RegistrationError where a start ends without a single hit: it has no gradient to follow."""
     lost = np.flatnonzero(hits == 0)
     if lost.size:
         place = ", ".join(f"{c:.1f}" for c in starts[lost[0], :3, 3])

@@ -10,7 +10,7 @@ from tilestream.records import Cells, Int64
 from tilestream.tiling import MM_PER_M, whole_mm
 
 MIN_POINTS = 6
-"""Fewest map points of a cell."""
+"""Least number of map points of a cell."""
 _LIMITS_MM = np.full(3, EXACT_MM - 1.0)
 
 

@@ -1,4 +1,4 @@
-"""What passes between the rooms: frozen values, a line under every field, frames in names."""
+"""The data types that modules exchange: frozen, every field documented, frames in names."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -32,8 +32,8 @@ class Scan:
     time_offset: Float64 | None = None
     """(n,) time of each point minus `stamp_ns` [s]; None where the log has none."""
     dropped: int = 0
-    """Points of the recorded scan that are not here because they were no returns: not finite, or
-    at the lidar's own origin."""
+    """Points of the recorded scan that were left out as they are no returns: not finite, or at the
+    lidar's own origin."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class Route:
     crs: str | None = None
     """Coordinate reference system, where the file or the user names it."""
     dropped: int = 0
-    """Points of the file that repeated the one before them and are not here."""
+    """Points of the file that were left out as they repeat the one before."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -180,7 +180,7 @@ class Cells:
 
 
 def _real(values: ArrayLike, name: str) -> Float64:
-    """A copy as float64, refusing what are no numbers."""
+    """A copy as float64; UsageError if it is not numeric."""
     given = np.asarray(values)
     if given.dtype.kind not in "iuf":
         raise UsageError(f"Cells: {name} has type {given.dtype}, expected numbers")
@@ -188,7 +188,7 @@ def _real(values: ArrayLike, name: str) -> Float64:
 
 
 def _whole(values: ArrayLike, name: str) -> Int64:
-    """A copy as int64, refusing numbers that are not whole."""
+    """A copy as int64; UsageError if a number is not whole."""
     given = np.asarray(values)
     if given.dtype.kind not in "iuf":
         raise UsageError(f"Cells: {name} has type {given.dtype}, expected whole numbers")
@@ -198,8 +198,9 @@ def _whole(values: ArrayLike, name: str) -> Int64:
 
 
 Criterion = Literal["FS", "RQ", "LY", "LS", "OB", "place", "label"]
-"""Feature sufficiency, representation quality, layout, local similarity (the paper, section V); or
-where a row is; or what was measured there."""
+"""FS feature sufficiency, RQ representation quality, LY layout, LS local similarity (the paper,
+section V), OB observability; `place`: which row it is; `label`: what was measured or estimated
+there."""
 
 
 @dataclass(frozen=True)
@@ -209,7 +210,7 @@ class Column:
     name: str
     """Its name in every table."""
     criterion: Criterion
-    """What it belongs to."""
+    """Criterion of a factor, or the kind of another column."""
     unit: str
     """Unit of its values: `m`, `bit`, `1` for a plain number, …"""
     meaning: str
@@ -217,14 +218,17 @@ class Column:
     source: str
     """The formula, and where it comes from: `eq. 4`, `definitions, section 4`, …"""
     factor_set: Literal["faithful", "robust", "observability"] = "faithful"
-    """The paper's own, or a twin that is not degenerate (definitions, sections 3 and 4)."""
+    """The paper's own, or a twin that is not degenerate (definitions, section 3 and
+    definitions, section 4)."""
     dtype: str = "float64"
     """Type of its values."""
 
 
 @dataclass(frozen=True, eq=False)
 class Registrations:
-    """What registering one scan from k starts gave; a row per start, in the order of the starts."""
+    """The result of registering one scan from k starts; a row per start, in the order of the
+    starts.
+    """
 
     T_map_lidar: Float64
     """(k, 4, 4) final poses."""
@@ -250,7 +254,7 @@ class Registrations:
 
 
 TruePose = Literal["log", "refined"]
-"""Where a true pose is from: the log (or the simulator), or refined with the scan it judges."""
+"""Source of a true pose: the log (or the simulator), or refined with the same scan."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,11 +268,11 @@ class LocalizationError:
     T_map_lidar: Float64
     """(4, 4) the true pose."""
     true_pose: TruePose
-    """Where the true pose is from; labels of the two kinds are never mixed."""
+    """Source of the true pose; labels of the two kinds are never mixed."""
     T_map_lidar_starts: Float64
     """(k, 4, 4) the starts."""
     registrations: Registrations
-    """What became of them."""
+    """Their results."""
     along: Float64
     """(k,) error along the true heading [m], forward positive."""
     across: Float64

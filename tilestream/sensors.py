@@ -1,4 +1,4 @@
-"""The sensor is data: what a lidar sees, as numbers that a user can write down for another one."""
+"""Sensors as data: the numbers that describe a lidar; users write them down for their own."""
 
 import itertools
 from typing import Annotated, Self
@@ -12,7 +12,7 @@ class Sensor(Settings):
     """A spinning lidar."""
 
     name: str
-    """What to call it in tables and reports."""
+    """Its name in tables and reports."""
     range_max: Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
     """Largest range of a return [m]."""
     elevations_deg: Annotated[tuple[float, ...], Field(min_length=2)]

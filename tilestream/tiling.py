@@ -1,4 +1,4 @@
-"""Where tiles are: keys, core and halo boxes, tile-local origins, all in whole millimetres.
+"""Geometry of tiles: keys, core and halo boxes, tile-local origins, all in whole millimetres.
 
 A tile is a square column of the map: its core box [ix, ix + 1) x [iy, iy + 1) times the tile size,
 without limits in z. The lattice origin is the map's origin (0, 0, 0), so that a voxel index is the
@@ -28,7 +28,7 @@ def whole_mm(length_m: float, name: str) -> int:
 
     Args:
         length_m: a length [m].
-        name: what it is, for the message.
+        name: what the length is called in the error message.
 
     Raises:
         UsageError: it is not a whole number of millimetres, or not finite.
@@ -113,7 +113,7 @@ class TileGrid:
     tile_mm: int
     """Edge of a tile [mm]."""
     halo_mm: int
-    """Width of the halo that tasks read around a tile [mm]."""
+    """Width of the map around a tile that tasks read too [mm]."""
 
     def __post_init__(self) -> None:
         if not 0 < self.tile_mm <= MAX_TILE_MM:
@@ -145,7 +145,7 @@ class TileGrid:
         return key.ix * self.tile_mm, key.iy * self.tile_mm, 0
 
     def core(self, key: TileKey) -> Box:
-        """The box of the points that the tile owns."""
+        """The box [mm, map frame] of the points that belong to the tile."""
         x, y, _ = self.origin_mm(key)
         return Box(x, y, x + self.tile_mm, y + self.tile_mm)
 
@@ -162,7 +162,7 @@ class TileGrid:
                 yield TileKey(ix, iy)
 
     def require_cell_size(self, cell_mm: int) -> None:
-        """Refuse a cell size of which the tile size is no integer multiple.
+        """Check that the tile size is an integer multiple of a cell size [mm].
 
         Raises:
             UsageError: names the nearest tile sizes and cell sizes that work.

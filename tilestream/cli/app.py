@@ -45,6 +45,10 @@ COMMANDS = {
         "jobs",
         "Simulate a survey of Shinjuku and drives through it; a killed run continues.",
     ),
+    "explain": (
+        "explain",
+        "What a factor, a column, a setting or a term means: unit, formula, default.",
+    ),
     "template": ("jobs", "Print a job for your city: a YAML file that explains every setting."),
     "run": (
         "jobs",

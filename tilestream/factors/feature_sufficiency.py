@@ -56,7 +56,7 @@ COLUMNS = (
             "1",
             f"Mean share of {shape} in a cell's shape; a cell between two shapes does not flip, as "
             f"it does in D{d}_ratio.",
-            f"definitions, section 4: sum of a{d} over V(P) / N, a1 + a2 + a3 = 1",
+            f"definitions, section 4.1: sum of a{d} over V(P) / N, a1 + a2 + a3 = 1",
             "robust",
         )
         for d, shape in ((1, "line"), (2, "plane"), (3, "scatter"))
@@ -67,8 +67,8 @@ COLUMNS = (
         "1",
         "Share of the map points in view that lie in voxels with too few points for a cell: what "
         "the map shows and the matcher cannot use.",
-        "definitions, section 4: points of voxels with n < 6 whose mean is in view / all points of "
-        "voxels in view",
+        "definitions, section 4.1: points of voxels with n < 6 whose mean is in view / all points "
+        "of voxels in view",
         "robust",
     ),
 )

@@ -1,8 +1,9 @@
-"""Ghosts: what passed by while the map was made, and stands in it as if it were there.
+"""Ghosts: surfels of traffic that moved while the map was surveyed (definitions, section 4.2).
 
-A parked car hides the ground beneath it in every pass of the survey; a moving one does not: where
-it was, the ground is in the map too. So what stands in the open on visible ground is a ghost. What
-is thin enough for ground to show all around it, a lamp post or a fence, may be taken for one.
+A parked car hides the ground beneath it in every pass of the survey. A moving car does not: the map
+has the ground there too. So what stands above mapped ground, with mapped ground around it, is a
+ghost. Thin objects with ground all around, such as lamp posts or fences, may be classified as
+ghosts too.
 """
 
 import numpy as np
@@ -13,15 +14,15 @@ from tilestream.factors.surfels import Surfels
 LOW_MM, HIGH_MM = 300, 3_400
 """Heights above the ground between which traffic stands [mm]."""
 BLOCK = 5
-"""Columns along the edge of the blocks in which the lowest surfel tells the ground: 1 m."""
+"""Edge of the blocks [columns] whose lowest surfel is the ground: 1 m."""
 AROUND = 2
-"""Columns on each side that must show ground too: 5 x 5 in all."""
+"""Columns on each side that are checked for ground too: 5 x 5 in all."""
 OPEN = 0.7
-"""Share of these columns that must."""
+"""Least share of these columns that must show ground."""
 REACH_EDGES = 2 * BLOCK + AROUND
-"""How far around a surfel the map decides whether it is a ghost [edges]: 2.4 m."""
+"""How far around a surfel the map is needed to decide whether it is a ghost [edges]: 2.4 m."""
 NONE_MM = 2**30
-"""Height of nothing: above all ground [mm]."""
+"""Height of a column without surfels: above all ground [mm]."""
 
 Int32 = NDArray[np.int32]
 
@@ -33,9 +34,12 @@ def ghosts_among(surfels: Surfels, edge_mm: int) -> NDArray[np.bool_]:
     own column, of one voxel, and 70 % of the 5 x 5 around it show ground and nothing above 3.4 m.
 
     Args:
-        surfels: those of a part of the map; what lies within `REACH_EDGES` of its rim is judged
-            from what is there.
+        surfels: the surfels of a part of the map; within `REACH_EDGES` of its rim the result may
+            be wrong, since surfels around are missing.
         edge_mm: edge of their voxels [mm].
+
+    Returns:
+        (n,) True for a ghost.
     """
     if not len(surfels):
         return np.zeros(0, np.bool_)
@@ -67,7 +71,7 @@ def _ground(lowest: Int32) -> Int32:
 
 
 def _sum_around(shows: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """How many of the columns around each, itself included, show ground."""
+    """Number of columns that show ground in the 5 x 5 around each column, itself included."""
     padded = np.pad(shows.astype(np.uint8), AROUND)
     steps = range(2 * AROUND + 1)
     rows, columns = shows.shape

@@ -1,8 +1,8 @@
-"""Layout of the features: how they stand around the sample point (the paper, section V.C).
+"""Layout: how the cells are arranged around the sample point (the paper, section V.C).
 
-The robust twins mend what the paper's factors lose (definitions, section 4): `FDOP` is a distance,
-so true dilutions of precision stand beside it; flat ground alone fills `normal_H_90` with noise and
-a wall's normal straddles two of its rows, so walls are told apart by their axis only.
+The robust twins mend what the paper's factors lose (definitions, section 4.1). `FDOP` is a
+distance, so true dilutions of precision stand beside it. Flat ground alone fills `normal_H_90` with
+noise, and a wall's normal straddles two of its rows, so walls are told apart by their axis only.
 """
 
 import numpy as np
@@ -16,10 +16,10 @@ FLAT = 0.9
 """A cell with |n_z| of at least this is ground or ceiling: it says nothing about x and y."""
 WALL_BINS = HISTOGRAMS["wall"]
 WALL_WEIGHTS = (1, 2, 3, 2, 1)
-"""How much of a bin of wall directions goes to the bins around it."""
+"""Weights that smooth the histogram of wall directions, from two bins before to two after."""
 SINGULAR = 1e-6
-"""Directions whose least mean square share is below this do not span space."""
-_SECTIONS = "definitions, section 4: "
+"""Directions whose smallest principal mean square is below this do not span space."""
+_SECTIONS = "definitions, section 4.1: "
 
 COLUMNS = (
     Column(
@@ -151,7 +151,9 @@ def normal_bins(normal: Float64, m: int) -> Int64:
 
 
 def terms(cells: Cells, points_mm: Int64, cell_of_point: Int64) -> Terms:  # noqa: ARG001
-    """Bins of the normals and their products; whether a cell stands."""
+    """Bins of the normals, products of their components, and whether a cell is no ground or
+    ceiling.
+    """
     n = cells.normal
     standing = np.abs(n[:, 2]) < FLAT
     wall = _bin(_azimuth(n) % np.pi, 0.0, np.pi / WALL_BINS) % WALL_BINS

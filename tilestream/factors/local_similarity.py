@@ -1,6 +1,6 @@
-"""Local similarity: how much the surroundings look like themselves (the paper, section V.B).
+"""Local similarity: how much parts of the surroundings look alike (the paper, section V.B).
 
-The robust twins mend what the paper's factors lose (definitions, section 4): `score_H` with raw
+The robust twins mend what the paper's factors lose (definitions, section 4.1): `score_H` with raw
 normalisation hardly moves, so a softmax of the mean score takes its place; `pfh_sim_mnht` and
 `bhatt_sim` mostly count cells, so they are divided by their pairs.
 """
@@ -25,12 +25,12 @@ from tilestream.records import Cells, Column, Float64, Int64
 NEIGHBOUR_RADIUS = 5.0
 """Cells whose means are this near are neighbours [m]."""
 TEMPERATURE = 0.05
-"""Difference of mean scores that makes one shift e times as likely as another."""
+"""Difference of mean scores at which one shift is e times as likely as another."""
 PEAK = 0.01
 """A secondary peak is at least this share of the highest."""
 FIT = 2
 """The curvature is fitted to the shifts up to this many steps from the middle."""
-_SECTION = "definitions, section 4"
+_SECTION = "definitions, section 4.1"
 _SOFT = "P(v) ~ exp(s(v) / 0.05), s the mean over the vicinity points of the score"
 
 COLUMNS = (

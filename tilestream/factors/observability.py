@@ -1,4 +1,5 @@
-"""Observability: how firmly a scan holds its place in the map, in every direction of the route.
+"""Observability: how well a scan constrains the pose, per axis of the route (definitions,
+section 4.4).
 
 A fifth criterion that the paper lacks, from the map alone: the virtual scan of the sensor from the
 sample point (`virtual_scan.py`), the NDT Hessian of that scan at the sample point, and where
@@ -25,8 +26,8 @@ from tilestream.factors.virtual_scan import (
     Scene,
     VirtualScan,
     VirtualSettings,
-    crowded,
     first_returns,
+    near_share,
     virtual_scan,
 )
 from tilestream.formats.poses import transform
@@ -40,18 +41,18 @@ from tilestream.tiling import MM_PER_M, Box
 BLOCK = 25.0
 """Sample points within a square of this edge share a scene [m]."""
 MARGIN = 10.0
-"""Map around what a scan sees: the way a start can go, and a cell [m]."""
+"""Map beyond the range of a scan that is read: how far a start can move, and a cell [m]."""
 INSIDE = 0.4
-"""A place is inside a wall if more than this share of the beams meet the map at arm's length."""
+"""A place is inside a wall if more than this share of the beams meet the map within `range_min`."""
 NOTHING = "nothing in view: {} of {} beams come back"
 WALLED = "inside a wall: {:.0%} of the beams meet the map within {:g} m"
 
 
 Row = dict[str, object]
-"""A row of the table by column, without what is missing."""
+"""A row of the table by column name; columns that are not known are left out."""
 
 
-def _column(name: str, unit: str, meaning: str, source: str = "definitions, section 4") -> Column:
+def _column(name: str, unit: str, meaning: str, source: str = "definitions, section 4.4") -> Column:
     return Column(name, "OB", unit, meaning, source, "observability")
 
 
@@ -75,7 +76,9 @@ VIEW_COLUMNS = (
     _column("ob_score", "1", "Expected score at the sample point, mean per scan point.", "eq. 12"),
     _column("ob_nvtl", "1", "Expected NVTL at the sample point.", "Autoware"),
     _column("ob_points", "1", "Points of the virtual scan after thinning."),
-    _column("ob_cells", "1", "Cells whose voxels these points hit."),
+    _column(
+        "ob_cells", "1", "Cells whose voxels the points of the virtual scan hit, before thinning."
+    ),
     _column("ob_returns", "1", "Share of the beams that come back."),
     _column("ob_unmapped", "1", "Share of the beams that meet nothing and leave the mapped area."),
     _column("ob_ghosts", "1", "Share of the beams that traffic in the map would stop, left out."),
@@ -95,8 +98,8 @@ def observability(
 ) -> pd.DataFrame:
     """The observability factors and the virtual drive at sample points of a map.
 
-    Places are taken in whole millimetres, rounded. The result is the same to the bit for any tiling
-    of the map, any company and any order of the places.
+    Places are taken in whole millimetres, rounded. The result has the same bits for any tiling
+    of the map, any choice and any order of the places.
 
     Args:
         store: the map.
@@ -137,7 +140,7 @@ def observability(
 
 
 class _View:
-    """What all places have in common."""
+    """Map, sensor and settings that all sample points share."""
 
     def __init__(
         self,
@@ -156,9 +159,10 @@ class _View:
         self.starts = stratified_starts(seeing.starts)
 
     def rows(self, places: Float64, turns: Float64, some: Int64) -> Iterator[tuple[int, Row]]:
-        """The rows of some places, which share what is read of the map.
+        """The rows of some places, for which the map is read once.
 
-        Where a part of it cannot be read, each place looks alone: so none fails for another one.
+        Where a part of the map cannot be read, each place is computed alone, so that none fails
+        because of another one.
         """
         try:
             surfels, ghosts, cells = self.around(places[some])
@@ -175,7 +179,9 @@ class _View:
                 yield int(row), self.seen_from(scene, passed, cells, places[row], turns[row])
 
     def around(self, places: Float64) -> tuple[Surfels, Surfels, Cells]:
-        """What of the map can be seen from the places, the ghosts, and the cells around that."""
+        """The surfels that can be seen from the places, those of them that are ghosts apart, and
+        the cells around.
+        """
         reach, edge_mm = self.beams.range_max, surfel_mm(self.store)
         rim = 1.0 + REACH_EDGES * edge_mm / MM_PER_M
         surfels = surfels_in(self.store, Box.around(places, reach + rim))
@@ -190,7 +196,7 @@ class _View:
         return real, ghosts, cells
 
     def scene(self, surfels: Surfels, places: Float64) -> Scene | None:
-        """What places near one another see; None: nothing."""
+        """The scene that places near one another share; None: nothing is in view."""
         near = in_view(surfels, places, self.sensor.fov_deg, self.beams.range_max)
         return Scene.of(near, whole_places(places), surfel_mm(self.store)) if len(near) else None
 
@@ -202,12 +208,12 @@ class _View:
         place: Float64,
         heading: float,
     ) -> Row:
-        """The row of a place, without what is missing there."""
+        """The row of a place; columns that are not known there are left out."""
         n = len(self.beams.direction)
         if scene is None:
             return {"status": "missing", "reason": NOTHING.format(0, n)}
         place_mm = whole_places(place)
-        walled = crowded(scene, place_mm, self.beams, self.seeing.range_min)
+        walled = near_share(scene, place_mm, self.beams, self.seeing.range_min)
         if walled > INSIDE:
             reason = WALLED.format(walled, self.seeing.range_min)
             return {"status": "failed", "reason": reason}
@@ -232,7 +238,7 @@ class _View:
     def hidden_by(
         self, ghosts: Scene | None, scan: VirtualScan, place_mm: Int64, heading: float
     ) -> float:
-        """Share of the beams that ghosts would stop before they meet what the scan says."""
+        """Share of the beams that ghosts would stop before the return of the scan."""
         if ghosts is None:
             return 0.0
         ranges, _, _ = first_returns(ghosts, place_mm, heading, self.seeing, self.beams)
@@ -255,7 +261,7 @@ class _View:
 def hessian_factors(
     cells: Cells, points: Float64, T_map_lidar: Float64, registration: RegistrationSettings
 ) -> dict[str, float]:
-    """How firmly a scan holds its place: the NDT Hessian and score, without a step.
+    """How well a scan constrains the pose: the NDT Hessian and score at the place, without a step.
 
     Args:
         cells: the map around the place.
@@ -287,7 +293,7 @@ def _distinct(voxels: Int64) -> Int64:
 
 
 def _within_reach(cells: Cells, voxels: Int64) -> Cells:
-    """The cells that a point in one of the voxels can be scored against: no other one counts."""
+    """The cells that a point in one of the voxels can be scored against."""
     around = np.array(list(itertools.product((-1, 0, 1), repeat=3)))
     wanted = _distinct((voxels[:, None] + around).reshape(-1, 3))
     rows = np.sort(cell_of_points(wanted, 1, cells.index))
@@ -302,7 +308,7 @@ def _within_reach(cells: Cells, voxels: Int64) -> Cells:
 
 
 def information(L_map: Float64, heading: float) -> dict[str, float]:
-    """What -H says about each axis of the route, whatever the others do.
+    """The information of -H per axis of the route, with the other axes free.
 
     Args:
         L_map: (6, 6) -H for steps (tau, w) in the map frame [m, rad].
@@ -310,7 +316,7 @@ def information(L_map: Float64, heading: float) -> dict[str, float]:
 
     Returns:
         `HESSIAN_COLUMNS`. A Schur complement may be negative where H is not definite; there the
-        variances are NaN. Where what is left out is singular it is NaN too.
+        variances are NaN. Where the part of the other axes is singular it is NaN.
     """
     R = np.eye(6)
     R[:2, :2] = R[3:5, 3:5] = _turn(heading)
@@ -329,7 +335,7 @@ def information(L_map: Float64, heading: float) -> dict[str, float]:
 
 
 def _schur(L: Float64, kept: list[int]) -> Float64:
-    """The Schur complement of some axes, the others free; NaN where those are singular."""
+    """The Schur complement of the axes `kept`, the others free; NaN where those are singular."""
     free = [axis for axis in range(len(L)) if axis not in kept]
     try:
         solved = np.linalg.solve(L[np.ix_(free, free)], L[np.ix_(free, kept)])
@@ -345,10 +351,10 @@ def in_view(
     """The surfels that a beam from any of the places can meet, and a few more.
 
     Args:
-        surfels: all around.
+        surfels: the surfels around the places.
         places: (k, 3) places [m, map frame], best near one another.
         fov_deg: lowest and highest elevation of the beams [deg].
-        reach: how far they go [m].
+        reach: range of the beams [m].
     """
     middle = places.mean(axis=0)
     around = float(np.hypot(*(places - middle)[:, :2].T).max())
@@ -363,7 +369,7 @@ def in_view(
 
 
 def tiles_of(places: Float64, store: TileStore) -> Iterator[Int64]:
-    """Rows of the places in each tile, those with a height only."""
+    """Rows of the places in each tile; places without a height are left out."""
     there = np.flatnonzero(~np.isnan(places[:, 2]))
     keys = [store.grid.key_at(x, y) for x, y in places[there, :2].tolist()]
     for key in sorted(set(keys)):
@@ -371,7 +377,7 @@ def tiles_of(places: Float64, store: TileStore) -> Iterator[Int64]:
 
 
 def blocks_of(places: Float64, some: Int64) -> Iterator[Int64]:
-    """Those of some rows that share a scene."""
+    """The rows `some`, grouped by the scene that they share."""
     blocks = np.floor(places[some, :2] / BLOCK).astype(np.int64)
     for block in np.unique(blocks, axis=0):
         yield some[(blocks == block).all(axis=1)]

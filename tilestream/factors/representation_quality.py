@@ -1,4 +1,4 @@
-"""Representation quality: what the map's points lose as cells (the paper, section V.D)."""
+"""Representation quality: how well cells represent the map points (the paper, section V.D)."""
 
 from tilestream.factors.vicinity import Sums, Terms, ratio
 from tilestream.kernels.nearest import REACH, group_by_cell, nearest_mean_sums

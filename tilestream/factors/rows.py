@@ -1,4 +1,4 @@
-"""What every table of sample points begins and ends with: which place, and whether it is done."""
+"""Columns that every table of sample points has: the place first, status and reason last."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,7 +22,13 @@ PLACE_COLUMNS = (
     Column("heading", "place", "rad", "Direction of travel, from the map's x axis.", ""),
     Column("x", "place", "m", "Place of the lidar.", "definitions, section 2"),
     Column("y", "place", "m", "Place of the lidar.", "definitions, section 2"),
-    Column("z", "place", "m", "Place of the lidar: route or ground, plus its height.", "section 2"),
+    Column(
+        "z",
+        "place",
+        "m",
+        "Place of the lidar: route or ground, plus its height.",
+        "definitions, section 2",
+    ),
 )
 STATUS_COLUMNS = (
     Column("status", "place", "", "done, missing or failed.", "", dtype="str"),
@@ -45,7 +51,7 @@ ROW = np.dtype(
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """The sample points of one tile, on the road: 48 bytes each, so that a plan holds a city's."""
+    """The sample points of one tile, on the road: 48 bytes each, so that a plan can hold a city."""
 
     route_ids: tuple[str, ...]
     """Names of the routes that they lie on."""
@@ -61,7 +67,7 @@ class Samples:
         return np.column_stack([self.rows["x"], self.rows["y"]])
 
     def facts(self) -> list[Any]:
-        """All that it is, as JSON has it: a part of the identity of tables made from it."""
+        """The content as JSON values: part of the identity of tables that are made from it."""
         return [self.route_ids, self.rows.tolist()]
 
 
@@ -129,8 +135,8 @@ def sample_rows(samples: Samples, store: TileStore, sensor_height: float) -> pd.
     """Sample points as rows of `PLACE_COLUMNS`, raised to the lidar.
 
     Args:
-        samples: on the road.
-        store: the map, which tells the ground where a route has no z.
+        samples: the sample points, on the road.
+        store: the map; it gives the ground where a route has no z.
         sensor_height: height of the lidar above the road [m].
 
     Raises:

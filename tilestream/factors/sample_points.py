@@ -10,7 +10,7 @@ from tilestream.store import POINTS, Tile, TileStore
 from tilestream.tiling import MM_PER_M, Box, TileKey
 
 GROUND_RADIUS_MM = 1000
-"""How far around a place the ground is looked for, horizontally [mm]."""
+"""Horizontal distance around a place within which map points give the ground [mm]."""
 GROUND_PERCENTILE = 5.0
 """Which percentile of the heights there counts as the ground."""
 
@@ -18,11 +18,11 @@ GROUND_PERCENTILE = 5.0
 def sample_points(
     route: Route, store: TileStore, spacing: float = 1.0, sensor_height: float = 2.0
 ) -> Route:
-    """The places of the lidar along a route, at equal arc length.
+    """The places of the lidar along a route, at equal steps of arc length.
 
     Args:
         route: a path on the road, in the map's frame.
-        store: the map, which tells the ground where the route has no z.
+        store: the map; it gives the ground where the route has no z.
         spacing: arc length between sample points [m].
         sensor_height: height of the lidar above the road [m].
 
@@ -46,7 +46,7 @@ def sample_points(
 
 
 def raised(positions: ArrayLike, store: TileStore, sensor_height: float = 2.0) -> Float64:
-    """Places on the road, raised to the lidar: z + height, or ground + height where z is NaN.
+    """Places on the road, raised to the lidar's height: z + height, or ground + height if z is NaN.
 
     The ground is the 5th percentile (linear between ranks) of z of the map points within 1.0 m
     horizontally.

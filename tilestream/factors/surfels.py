@@ -1,7 +1,8 @@
-"""The surfels of a map, tile by tile: what a virtual scan sees instead of points.
+"""The surfels of a map, tile by tile: a virtual scan is cast at them instead of points.
 
-One per voxel of 0.2 m that holds map points (a coarser map: per voxel of its leaf): the plane of
-the points around it as a small disc, or a ball where they make no plane.
+One per voxel of 0.2 m that holds map points, or per voxel of the map's leaf where that is larger: a
+small disc in the plane of the points around it, or a ball where they form no plane (definitions,
+section 4.2).
 """
 
 from dataclasses import dataclass
@@ -22,12 +23,12 @@ SURFELS_VERSION = 1
 FINEST_MM = 200
 """Smallest edge of the voxels of surfels [mm]."""
 REACH_EDGES = 4
-"""How far around its voxel the points that decide a surfel can lie, with their voxels [edges]."""
+"""How far from its voxel the points that a surfel depends on can lie, with their voxels [edges]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Surfels:
-    """Discs and balls that stand for the points of a map."""
+    """Discs and balls that represent the points of a map."""
 
     centre_mm: Int64
     """(n, 3) centres [mm, map frame], in the order of their voxels."""
@@ -40,7 +41,7 @@ class Surfels:
         return len(self.centre_mm)
 
     def where(self, chosen: NDArray[np.bool_]) -> Self:
-        """Some of them."""
+        """The surfels where `chosen` (n,) is True."""
         return type(self)(self.centre_mm[chosen], self.normal[chosen], self.radius_mm[chosen])
 
 
@@ -62,7 +63,7 @@ def surfels_table(edge_mm: int) -> TileTable:
 
 
 def tile_surfels(store: TileStore, key: TileKey) -> Surfels:
-    """The surfels of the voxels whose lowest corners a tile owns: the same for any tiling.
+    """The surfels of the voxels whose lowest corners lie in a tile: the same for any tiling.
 
     Raises:
         TileNotReadyError: the tile, or a neighbour that exists, is not done; says why.
@@ -76,6 +77,7 @@ def tile_surfels(store: TileStore, key: TileKey) -> Surfels:
 
 
 def _columns(store: TileStore, key: TileKey, surfels: Surfels) -> dict[str, NDArray[Any]]:
+    """A tile's surfels as the store keeps them: arrays by name, from the tile's origin."""
     origin = np.array(store.grid.origin_mm(key), np.int64)
     return {
         "centre": np.ascontiguousarray((surfels.centre_mm - origin).T.astype(np.int32)),

@@ -1,4 +1,4 @@
-"""Sample points in, a table of factors out."""
+"""The table of factors at sample points, from the terms of the tiles around them."""
 
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator
@@ -33,7 +33,7 @@ def factors_at(
     Args:
         places: (k, 3) finite sample points [m, map frame], best in the order of a route; some
             hundreds at most, for memory.
-        sensor: what looks.
+        sensor: range, field of view and beams.
         tiles: the terms of all tiles within range; best the nearest first.
         which: the paper's factors, their robust twins, or both.
 
@@ -110,7 +110,7 @@ def factors(
     which: Which = "faithful",
     cache: TermsCache | None = None,
 ) -> pd.DataFrame:
-    """The factors of the definitions, sections 3 and 4, at sample points of a map.
+    """The factors (definitions, section 3 and definitions, section 4.1) at sample points of a map.
 
     Args:
         store: the map.

@@ -1,7 +1,7 @@
-"""The terms stage: everything about a tile's cells that does not depend on the sample point.
+"""The terms of a tile: everything about its cells that does not depend on the sample point.
 
 A cell's neighbours are those of the whole map (definitions, section 2), so the cells of a halo
-around the tile take part; what is kept is the tile's own.
+around the tile are read too; only the tile's own are kept.
 """
 
 import numpy as np
@@ -20,9 +20,10 @@ TERMS_VERSION = 2
 DEPTH_MM = 500
 """Edge of the voxels to which map points are thinned for the depth image [mm]."""
 REACH_MM = 10_000
-"""How far the terms of a cell look [mm]: its neighbours' neighbours, 5 m and 5 m."""
+"""Distance within which the terms of a cell depend on other cells [mm]: its neighbours'
+neighbours, 5 m and 5 m."""
 SHIFT_MM = 3_000
-"""How far the 441 shifts carry a point, sqrt(8) m [mm], rounded up."""
+"""Largest of the 441 shifts, sqrt(8) m [mm], rounded up."""
 
 
 def reach_mm(cell_mm: int) -> int:
@@ -51,12 +52,12 @@ def terms_of(cells: Cells, points_mm: Int64, core: Box, depth_mm: Int64 | None =
     """The terms of a tile's cells.
 
     Args:
-        cells: those of the tile, and all others of the map within `reach_mm` of it (more do no
-            harm).
+        cells: the cells of the tile, and all others of the map within `reach_mm` of it; more are
+            allowed.
         points_mm: (n, 3) the tile's map points [mm].
         core: the tile, whose edges lie on the lattice of the cells.
-        depth_mm: (d, 3) the points of the depth image [mm] of which the tile takes care; None: the
-            tile's points thinned to 0.5 m, right where its edges lie on that lattice too.
+        depth_mm: (d, 3) the points of the depth image [mm] that this tile keeps; None: the tile's
+            points thinned to 0.5 m, which is right where its edges lie on that lattice.
     """
     near = _voxels_in(cells, core.grown(reach_mm(cells.cell_mm)))
     index, count = cells.index[near], cells.count[near]
@@ -105,7 +106,7 @@ def _voxels_in(cells: Cells, box: Box) -> Int64:
 def _depth_points(store: TileStore, key: TileKey) -> Int64:
     """The 0.5 m points of a tile whose edges cut their lattice.
 
-    A voxel that is cut has points in several tiles: the first of them, by key, takes care of it.
+    A voxel that is cut has points in several tiles: the first of them, by key, keeps it.
     """
     keys = list(store.grid.keys_over(store.grid.core(key).grown(DEPTH_MM)))
     there = [near for near in keys if Tile(store, near).mark(POINTS).status != "missing"]

@@ -1,7 +1,8 @@
-"""What a sample point sees: terms of cells as whole numbers, and their sums over vicinities.
+"""Vicinities of sample points: terms of cells as whole numbers, and their sums.
 
-Definitions, section 2. Every sum is a sum of integers (counts, or fixed point), so that it is the
-same bits for any tiling, any order of tiles and sample points, and any number of workers.
+The vicinity is that of definitions, section 2. Every sum is a sum of integers (definitions,
+section 1.2), so it has the same bits for any tiling, any order of tiles and sample points, and any
+number of workers.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -31,7 +32,7 @@ HISTOGRAMS = {"normal_8": 8 * 8, "normal_16": 16 * 16, "normal_90": 90 * 90, "wa
 STANDING = "standing"
 """The term that says whether a cell's normal is not vertical: its azimuth is counted apart."""
 CELL_BLOCK = 16.0
-"""Edge of the blocks of cells that are looked at together [m]; only speed depends on it."""
+"""Edge of the blocks in which cells are tested together [m]; only speed depends on it."""
 POINT_BLOCK, POINT_GROUP = 2.5, 4
 """Edge of the blocks of points of the depth image [m], and of groups of them in blocks."""
 
@@ -131,19 +132,19 @@ class TileTerms:
         )
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """What the store keeps: an array per field."""
+        """The fields as arrays, as the store keeps them."""
         kept = {f.name: getattr(self, f.name) for f in fields(self)}
         return {**kept, "names": np.frombuffer("\n".join(self.names).encode(), np.uint8)}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Self:
-        """The terms that `arrays` gave."""
+        """The terms from the arrays that `arrays` gave."""
         names = arrays["names"].astype(np.uint8).tobytes().decode().split("\n")
         return cls(**{**arrays, "names": tuple(names)})  # type: ignore[arg-type]
 
     @property
     def nbytes(self) -> int:
-        """Memory that the arrays take, with what is made from them [bytes]."""
+        """Memory of the arrays, with those that are derived from them [bytes]."""
         kept = sum(array.nbytes for array in self.arrays().values())
         return kept + self.mean.nbytes + self.depth_mm.nbytes + self.bins.nbytes * 2
 
@@ -204,7 +205,8 @@ def _blocks(points: Float64, edge: float) -> tuple[Float64, Int64, Float64]:
 def row_edges(sensor: Sensor) -> Float64:
     """Elevations of the edges of the depth image's rows [rad], rising; a row per beam.
 
-    Halfway between beams, the outer ones mirrored at the outer beams (definitions, factor 8).
+    Halfway between beams, the outer ones mirrored at the outer beams (definitions, section 3,
+    `occupancy_ratio`).
     """
     beams = np.radians(sensor.elevations_deg)
     between = (beams[:-1] + beams[1:]) / 2.0
@@ -213,7 +215,7 @@ def row_edges(sensor: Sensor) -> Float64:
 
 
 def _row_sines(sensor: Sensor) -> Float64:
-    """Sines of the rows' edges, each moved by 1e-9 of its row ("bins and ties")."""
+    """Sines of the rows' edges, each moved by 1e-9 of its row (definitions, section 1.1)."""
     edges = row_edges(sensor)
     height = np.diff(edges)
     moved = np.append(edges[:-1] - 1e-9 * height, edges[-1] + 1e-9 * height[-1])

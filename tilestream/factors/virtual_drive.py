@@ -1,7 +1,7 @@
-"""The virtual drive: where registrations of the virtual scan end, from the map alone.
+"""The virtual drive: where registrations of the virtual scan end (definitions, section 4.5).
 
-The paper's label, as if the scan of the place were what the map says: a few of its starts around
-the sample point, spread and weighted so that they stand for the whole disc.
+The paper's label, with the virtual scan in place of a real one: some of its 317 starts around the
+sample point, spread and weighted so that they represent the whole disc.
 """
 
 import math
@@ -14,16 +14,16 @@ from tilestream.localization import FAILED, NEAR, disc_starts, register, start_e
 from tilestream.records import Cells, Column, Float64
 
 STRATA = ((0.0, 0.5, 1.0 / 8.0), (0.5, 0.75, 1.0 / 4.0), (0.75, 1.0, 5.0 / 8.0))
-"""Rings of the disc of starts: beyond which share of its radius, up to which, and with which share
-of the starts. The far ones decide the tail."""
+"""Rings of the disc of starts: inner and outer radius as shares of the disc's, and share of the
+starts. Far starts decide the tail."""
 NEIGHBOURS = 2.0
-"""Virtual drives from within this distance along the route count as of one place [m]: the radius of
-the disc of starts."""
+"""Virtual drives within this distance along the route are averaged [m]: the radius of the disc of
+starts."""
 GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 """Turn from one start to the next, so that any number of them is spread evenly [rad]."""
 
 
-def _column(name: str, unit: str, meaning: str, source: str = "definitions, section 5") -> Column:
+def _column(name: str, unit: str, meaning: str, source: str = "definitions, section 4.5") -> Column:
     return Column(name, "OB", unit, meaning, source, "observability")
 
 
@@ -39,20 +39,20 @@ COLUMNS = (
 )
 
 AVERAGED = tuple(column.name for column in COLUMNS if column.name != "vd_median")
-"""What is averaged along the route; the median may have no number."""
+"""Columns that are averaged along the route; `vd_median` may be NaN, so it is not."""
 SLACK = 1e-6
 """Arc lengths are sums: neighbours at the full distance may lie this much beyond it [m]."""
 
 
 def stratified_starts(count: int | None = 64) -> tuple[Float64, Float64]:
-    """Some of the paper's 317 starts, spread evenly round each of three rings of their disc.
+    """Some of the paper's 317 starts, spread evenly over each of three rings of their disc.
 
     Args:
         count: how many, 8 or more; None, or as many as there are: all of them.
 
     Returns:
         (k, 2) offsets in map x and y [m], and (k,) weights that sum to 1: the share of the disc's
-        starts that each stands for.
+        starts that each represents.
     """
     disc = disc_starts()
     if count is None or count >= len(disc):
@@ -128,8 +128,8 @@ def weighted_median(values: Float64, weight: Float64) -> float:
 def physics(vd_mean: Float64, offset: float = 0.0) -> Float64:
     """The error as the virtual drive alone estimates it, without training [m].
 
-    A virtual scan is a better scan than a real one: nothing moves, nothing has changed since the
-    survey. What a real one adds to every start is one number, measured once or fitted on any drive.
+    A virtual scan is better than a real one: nothing moves, and nothing has changed since the
+    survey. The error that a real scan adds is one number, measured once or fitted on any drive.
 
     Args:
         vd_mean: (k,) [m].
@@ -147,13 +147,14 @@ def physics_offset(vd_mean: Float64, error_mean: Float64) -> float:
 def averaged_along(places: pd.DataFrame) -> pd.DataFrame:
     """The virtual drives of sample points, averaged with those of their neighbours on the route.
 
-    Where a registration ends is a draw, and places 1 m apart see nearly the same: their drives are
-    more draws of one. With sample points farther apart than `NEIGHBOURS` each stands for itself.
+    Where a registration ends is random to a degree, and places 1 m apart see nearly the same: their
+    drives are repeated samples of one value. Sample points farther apart than `NEIGHBOURS` keep
+    their own.
 
     Args:
         places: a row per sample point: `route_id`, `arc_length` [m], `status`, `COLUMNS`; an index
-            without repeats. The average of a point is true if all within `NEIGHBOURS` of it are
-            there.
+            without repeats. The average of a point is right if all points within `NEIGHBOURS`
+            of it are there.
 
     Returns:
         The table, rows in the same order, `AVERAGED` of the points that are done as means over the

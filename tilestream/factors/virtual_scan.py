@@ -1,4 +1,6 @@
-"""The scan that a lidar would take at a place, from the map alone: its surfels, ray by ray."""
+"""The scan that a lidar would take at a place, cast at the map's surfels (definitions, section
+4.3).
+"""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -27,7 +29,7 @@ from tilestream.sensors import Sensor
 from tilestream.tiling import MM_PER_M
 
 COLUMN_MM = 10_000
-"""Edge of the columns that the map covers or not [mm]."""
+"""Edge of the columns that tell where the map has anything [mm]."""
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 
@@ -38,30 +40,30 @@ class VirtualSettings(Settings):
     range_max: Annotated[float, Field(gt=0.0)] | None = None
     """Usable range [m], no more than the sensor's; None: the sensor's."""
     range_min: Annotated[float, Field(ge=0.0)] = 0.9
-    """What is nearer is the vehicle itself, and is looked through [m]."""
+    """Surfels nearer than this are ignored: the vehicle itself is there [m]."""
     blind_rear_deg: Annotated[float, Field(ge=0.0, lt=360.0)] = 0.0
     """Sector to the rear that the vehicle hides [deg]."""
     fading_from: Share = 0.6
-    """Share of the usable range beyond which returns get lost …"""
+    """Share of the usable range beyond which returns are lost …"""
     fading: Share = 0.6
     """… up to this share of them at its end, linearly."""
     grazing_deg: Annotated[float, Field(gt=0.0, lt=90.0)] = 75.0
-    """Angle of incidence beyond which returns get lost, as its cosine falls to 0 [deg]."""
+    """Angle of incidence beyond which returns are lost, more as its cosine falls to 0 [deg]."""
     without_ghosts: bool = True
-    """Whether traffic that was baked into the map is left out, see `ghosts.py`; also some thin
-    things are, such as posts."""
+    """Whether traffic that the survey recorded is left out of the scan (ghosts); some thin objects
+    such as posts are left out with it."""
     starts: Annotated[int, Field(ge=8)] | None = 64
     """Starts of the virtual drive, spread over the disc of starts; None: all of them."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
-    """Of noise and drop-outs, which the place decides together with it."""
+    """Seed of noise and drop-outs; the place is part of it too."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The surfels around some places, ready to be looked at."""
+    """The surfels around some places, indexed for ray casting."""
 
     bricks: Bricks
-    """As beams find them."""
+    """Index of the surfels by voxel."""
     mapped: NDArray[np.bool_]
     """(nx, ny) columns of 10 m that hold any of the map."""
     mapped_corner: Int64
@@ -69,7 +71,7 @@ class Scene:
 
     @classmethod
     def of(cls, surfels: Surfels, places_mm: Int64, edge_mm: int) -> "Scene":
-        """The scene of surfels, and of the places from which it will be looked at.
+        """The scene of surfels for scans from some places.
 
         Args:
             surfels: all that can be seen from the places; at least one.
@@ -99,13 +101,13 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class Beams:
-    """All beams of one turn of a sensor, as the vehicle lets them out."""
+    """All beams of one turn of a sensor outside the vehicle's blind sector."""
 
     direction: Float64
     """(n, 3) unit vectors in the lidar frame: x ahead, y left, z up; firing by firing, counter-
     clockwise from ahead, each from the lowest beam to the highest."""
     range_max: float
-    """How far they see [m]."""
+    """Usable range [m]."""
 
     @classmethod
     def of(cls, sensor: Sensor, seeing: VirtualSettings) -> "Beams":
@@ -125,14 +127,14 @@ class Beams:
         return cls(direction.reshape(-1, 3), min(reach, sensor.range_max))
 
 
-def crowded(scene: Scene, place_mm: Int64, beams: Beams, within: float) -> float:
-    """Share of the beams of a lidar at a place that meet the map within some metres.
+def near_share(scene: Scene, place_mm: Int64, beams: Beams, within: float) -> float:
+    """Share of the beams of a lidar at a place that meet the map within a short distance.
 
     Args:
         scene: the map around the place.
         place_mm: (3,) of the lidar [mm, map frame].
         beams: its beams, as if it headed along the map's x axis.
-        within: how near [m].
+        within: the distance [m].
     """
     n = len(beams.direction)
     ranges, cosine = np.empty(n), np.empty(n)
@@ -142,16 +144,16 @@ def crowded(scene: Scene, place_mm: Int64, beams: Beams, within: float) -> float
 
 @dataclass(frozen=True, eq=False)
 class VirtualScan:
-    """What the beams of one turn meet at a place."""
+    """The result of casting the beams of one turn at a place."""
 
     ranges: Float64
     """(n,) true range of each beam's first return [m]; inf: none."""
     cosine: Float64
-    """(n,) of its incidence; 0: none."""
+    """(n,) cosine of its incidence; 0: none."""
     came: NDArray[np.bool_]
     """(n,) which returns come back to the sensor."""
     points: Float64
-    """(m, 3) those, with the noise of the sensor, in the lidar frame [m]."""
+    """(m, 3) those returns with the noise of the sensor, in the lidar frame [m]."""
     return_share: float
     """Share of the beams that come back, 1 for all."""
     unmapped_share: float
@@ -197,7 +199,7 @@ def virtual_scan(
 def first_returns(
     scene: Scene, place_mm: Int64, heading: float, seeing: VirtualSettings, beams: Beams
 ) -> tuple[Float64, Float64, Float64]:
-    """What the beams of a lidar at a place meet first; arguments as of `virtual_scan`.
+    """The first surfels that the beams of a lidar at a place meet; arguments as of `virtual_scan`.
 
     Returns:
         (n,) ranges [m], inf where nothing is met; (n,) cosines of incidence, 0 there; (n, 3)
@@ -215,7 +217,7 @@ def first_returns(
 def probability(
     ranges: Float64, cosine: Float64, range_max: float, seeing: VirtualSettings
 ) -> Float64:
-    """(n,) how likely returns are to come back (see `virtual_scan`); 0 where there is none."""
+    """(n,) probability that returns come back (see `virtual_scan`); 0 where there is none."""
     there = np.isfinite(ranges)
     span = max((1.0 - seeing.fading_from) * range_max, 1e-9)
     far = np.clip((np.where(there, ranges, 0.0) - seeing.fading_from * range_max) / span, 0.0, 1.0)
@@ -224,7 +226,8 @@ def probability(
 
 
 def draws(place_mm: Int64, seed: int, beams: int, per_beam: int) -> Float64:
-    """(per_beam, beams) uniform numbers in (0, 1) that the place, the seed and the beam decide.
+    """(per_beam, beams) uniform random numbers in (0, 1) from the place, the seed and the beam
+    alone.
 
     splitmix64 (Steele, Lea and Flood 2014), counted from a hash of the place.
     """

@@ -44,7 +44,9 @@ PREDICTION_COLUMNS = (
     Column("estimate", "label", "m", "Estimated error_mean.", "definitions, section 6"),
     Column("low", "label", "m", "Lower end of its interval.", "calibrated by blocks"),
     Column("high", "label", "m", "Upper end of its interval.", "calibrated by blocks"),
-    Column("p_fail", "label", "1", "Estimated share of starts that fail.", "definitions, 5"),
+    Column(
+        "p_fail", "label", "1", "Estimated share of starts that fail.", "definitions, section 5"
+    ),
     Column("floor", "label", "m", "Estimated error_floor.", "definitions, section 5"),
     Column("tail", "label", "m", "Estimated error_tail.", "definitions, section 5"),
     Column("along", "label", "m", "Estimated mean of abs(along).", "definitions, section 5"),

@@ -1,4 +1,4 @@
-"""The bin of an azimuth on the full circle, as definitions, section 1, "bins and ties" wants it."""
+"""The bin of an azimuth on the full circle, as definitions, section 1.1, wants it."""
 
 import numpy as np
 
@@ -9,13 +9,13 @@ _TAU = 2.0 * np.pi
 _C0, _C1, _C2, _C3 = 0.99999611, -0.33317368, 0.19807816, -0.1323334
 _C4, _C5, _C6 = 0.07962362, -0.03360417, 0.00681177
 UNSURE = 1e-4
-"""A guess of `turns_guess` this near to a bin's edge [bins] is not to be relied on: its error of
-4e-8 turns is less for up to 2500 bins."""
+"""Within this distance of a bin's edge [bins] the result of `turns_guess` does not decide the bin:
+its error of 4e-8 turns is smaller than this for up to 2500 bins."""
 
 
 @njit(nogil=True, error_model="numpy", inline="always")
 def turns_guess(x, y):  # type: ignore[no-untyped-def]
-    """atan2(y, x) mod 2 pi in turns, to 1e-7, without a branch: loops over it vectorise.
+    """atan2(y, x) mod 2 pi [turns], right to 1e-7; without a branch, so that loops vectorise.
 
     The zero vector gives 0.
     """
@@ -40,7 +40,7 @@ def azimuth_bin_exactly(x, y, bins):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, error_model="numpy", inline="always")
 def is_unsure(turns, bins):  # type: ignore[no-untyped-def]
-    """Whether the guess of the turns lies so near to a bin's edge that it does not decide."""
+    """Whether an azimuth [turns] of `turns_guess` is too near to a bin's edge to decide the bin."""
     at = turns * bins
     rest = at - np.floor(at)
     return (rest < UNSURE) | (rest > 1.0 - UNSURE)

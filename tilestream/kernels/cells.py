@@ -43,7 +43,9 @@ def _bounds(points_mm):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, error_model="numpy", boundscheck=False)
 def _number_voxels(points_mm, edge_mm, low, span, table):  # type: ignore[no-untyped-def]
-    """Give every occupied voxel of the box a row, 0, 1, ... in `table`; the row of each point."""
+    """Give every occupied voxel of the box a row 0, 1, ... in `table`; returns the row of each
+    point and the number of rows.
+    """
     inverse = 1.0 / edge_mm
     lx, ly, lz, ny, nz = low[0], low[1], low[2], span[1], span[2]
     row_of_point = np.empty(points_mm.shape[0], np.int32)
@@ -66,7 +68,7 @@ def _number_voxels(points_mm, edge_mm, low, span, table):  # type: ignore[no-unt
 def _sum_voxels(points_mm, edge_mm, row_of_point, used):  # type: ignore[no-untyped-def]
     """Sums of the numbered voxels; rows are two cache lines wide, of which ten columns are used.
 
-    A loop of its own: adding to a row need not wait until the next point's row is known.
+    A loop of its own, so that adding to a row does not wait for the next point's row.
     """
     inverse = 1.0 / edge_mm
     rows = np.zeros((used, 16), np.int64)
@@ -109,9 +111,8 @@ def _in_order(rows, low, span, table, min_points):  # type: ignore[no-untyped-de
 
 
 def _cut(low: Int64, span: Int64, items: int) -> tuple[int, int] | None:
-    """Where to halve a box of voxels that is too large for a table: axis and first voxel above.
-
-    None while the table is small or fits the number of items that it serves.
+    """Where to halve a box of voxels that is too large for a table: axis and first voxel of the
+    upper half. None where the table is small, or no larger than twice the number of `items`.
     """
     if float(span[0]) * float(span[1]) * float(span[2]) <= max(2**20, 2 * items):
         return None

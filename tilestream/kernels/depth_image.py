@@ -1,7 +1,7 @@
-"""Which pixels of a lidar's depth image the map fills (factor `occupancy_ratio`).
+"""The pixels of a lidar's depth image that the map fills (factor `occupancy_ratio`).
 
-Exact, though most points are never looked at: a block of points is passed over when the pixels that
-its box can touch are all full already, and beyond some distance nearly all of them are.
+Exact, though most points are never read: a block of points is skipped when all pixels that its box
+can touch are full already. Beyond some distance nearly all of them are.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from tilestream.kernels.vicinity import AT_PLACE
 COLUMNS = 360
 """Azimuth columns of the image, 1 deg each."""
 MARGIN = 1e-6
-"""What rounding may do to the bounds of a box, generously [m, or sine]."""
+"""Safety margin for rounding in the bounds of a box [m, or sine]."""
 
 
 @njit(nogil=True)
@@ -44,9 +44,10 @@ def thin(index: NDArray[np.int64], sums: NDArray[np.int64], edge_mm: int) -> NDA
 
 @njit(nogil=True)
 def row_guesses(edges: NDArray[np.float64]) -> NDArray[np.int32]:
-    """The row at the beginning of each of many even steps from the lowest to the highest edge.
+    """A look-up table: the row at the beginning of each of many equal steps from the lowest to the
+    highest edge.
 
-    The steps are so short (but no more than 2^16) that each holds at most one edge.
+    Steps are so short that each holds at most one edge (but there are at most 2^16 of them).
     """
     rows = len(edges) - 1
     thinnest = np.min(np.diff(edges))
@@ -63,7 +64,7 @@ def row_guesses(edges: NDArray[np.float64]) -> NDArray[np.int32]:
 
 @njit(nogil=True, error_model="numpy", boundscheck=False)
 def _row_of(s, edges, guess):  # type: ignore[no-untyped-def]
-    """Row of the sine of an elevation; what lies beyond the outer edges is in the outer rows."""
+    """Row of an elevation, given its sine; beyond the outer edges: the outer rows."""
     last = len(edges) - 2
     slot = np.int64((s - edges[0]) * (len(guess) / (edges[-1] - edges[0])))
     row = np.int64(guess[min(max(slot, 0), len(guess) - 1)])
@@ -76,7 +77,9 @@ def _row_of(s, edges, guess):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, error_model="numpy", boundscheck=False)
 def _in_view(box, first, last, place, reach, edges, out):  # type: ignore[no-untyped-def]
-    """Boxes first to last that reach into the range and between the outer edges; their number."""
+    """Write to `out` which of the boxes first to last can be in range and between the outer edges;
+    their number.
+    """
     px, py, pz = place[0], place[1], place[2]
     low = edges[0] / np.sqrt(1.0 - edges[0] * edges[0])
     high = edges[-1] / np.sqrt(1.0 - edges[-1] * edges[-1])
@@ -132,7 +135,7 @@ def _is_full(box, i, place, edges, guess, image):  # type: ignore[no-untyped-def
 
 @njit(nogil=True, error_model="numpy", boundscheck=False)
 def _directions(x, y, z, place, reach, sines, turns):  # type: ignore[no-untyped-def]
-    """Sines of the elevations and turns of the azimuths of points; out of range: a sine of 2.
+    """Sines of the elevations and azimuths [turns] of points; a sine of 2 where out of range.
 
     A loop of its own, without a branch or a table, for the compiler to vectorise.
     """
@@ -147,7 +150,9 @@ def _directions(x, y, z, place, reach, sines, turns):  # type: ignore[no-untyped
 
 @njit(nogil=True, error_model="numpy", boundscheck=False)
 def _fill(x, y, z, place, reach, edges, guess, image, sines, turns, fresh, found):  # type: ignore[no-untyped-def]
-    """Fill the pixels of some points; those that filled an empty one are added to `fresh`."""
+    """Fill the pixels of some points; points that filled an empty pixel are added to `fresh`.
+    Returns the number of points in `fresh`.
+    """
     _directions(x, y, z, place, reach, sines, turns)
     low, high, last = edges[0], edges[-1], np.int64(len(edges) - 2)
     scale, steps = len(guess) / (high - low), np.int64(len(guess) - 1)
@@ -185,7 +190,7 @@ def add_points(
 
     A point with 0 < range <= reach fills the pixel of its azimuth (`COLUMNS` bins of the full
     circle) and elevation (rows between the edges, half-open upwards, the last one closed). The
-    points that filled the image before are tried first: most of them fill a pixel again.
+    points that filled the previous image are tried first: most of them fill a pixel again.
 
     Args:
         places: (k, 3) sample points [m, map frame], best in the order of a route.

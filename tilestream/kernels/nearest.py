@@ -1,4 +1,4 @@
-"""How well the cells stand for their points: distances to the nearest mean (eqs. 19 to 21)."""
+"""How well cells represent their points: distances to the nearest mean (eqs. 19 to 21)."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ at most sqrt(3) l away."""
 TIE = 1e-9
 """Means count as equally near when their distances differ by no more than this [m]."""
 STEPS_PER_M = 2.0**32
-"""Distances are summed as whole multiples of 2^-32 m, so that no order of points shows."""
+"""Distances are summed as whole multiples of 2^-32 m, so that the order of points has no effect."""
 STEPS_PER_SIGMA = 2.0**30
 """Mahalanobis distances are summed as whole multiples of 2^-30."""
 
@@ -20,7 +20,7 @@ STEPS_PER_SIGMA = 2.0**30
 def group_by_cell(
     cell_of_point: NDArray[np.int64], cells: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The points of each cell, by counting.
+    """The points of each cell, by a counting sort.
 
     Args:
         cell_of_point: (n,) row of each point's cell, -1 for none.
@@ -64,7 +64,8 @@ def from_corner(points_mm, members, corner_mm):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, boundscheck=False)
 def _rivals(mean, own, candidates, corner, middle, half, kept, at):  # type: ignore[no-untyped-def]
-    """Which candidates can be as near to a point of the box as the cell's own mean; their number.
+    """Keep the candidates that can be as near to a point of the box as the cell's own mean: rows
+    into `kept`, means from the corner into `at`. Returns their number.
 
     |x - mu_k|^2 - |x - mu_c|^2 is linear in x, so its least value in the box is at a corner.
     """
@@ -113,7 +114,7 @@ def nearest_mean_sums(
 
     Returns:
         (m,) sums of Euclidean distances [m] and (m,) of Mahalanobis distances (no unit); 0 for a
-        cell without points. Whole numbers inside: neither tiling nor order of points shows.
+        cell without points. Summed as whole numbers: tiling and order of points have no effect.
     """
     m = len(index)
     euclidean, mahalanobis = np.zeros(m), np.zeros(m)

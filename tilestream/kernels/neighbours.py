@@ -1,4 +1,4 @@
-"""Which cells are near which, as lists: the neighbours of definitions, section 3, and others."""
+"""Lists of the cells near each cell: the neighbours of definitions, section 3.1, and others."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,17 +6,17 @@ from numpy.typing import NDArray
 from tilestream.kernels.cache import njit
 
 WITHIN = 1e-9
-"""Distances that exceed a radius by no more than this are within it [m]: on regular maps rounding
-would choose."""
+"""Distances that exceed a radius by no more than this are within it [m]; on regular maps rounding
+would decide."""
 
 
 def _keys(
     index: NDArray[np.int64], reach: tuple[int, int, int]
 ) -> tuple[NDArray[np.int64], int, int]:
-    """One integer per voxel, rising lexicographically, so that near voxels are at fixed steps.
+    """One integer key per voxel, in lexicographic order, so that a neighbouring voxel is a fixed
+    step away.
 
-    Gaps wider than the reach are narrowed: they part cells just as well, and the key of any map
-    fits 63 bits.
+    Empty gaps wider than the reach are shortened, so that the keys of any map fit 63 bits.
 
     Returns:
         (m,) keys, and the steps to the next voxel in x and in y (in z it is 1).
@@ -37,10 +37,10 @@ def _keys(
 def _list_near(  # type: ignore[no-untyped-def]
     key, step_x, step_y, reach, mean, radius, itself, fill, start, near
 ):
-    """Write the starts, and the lists too if `fill` is set.
+    """Write the starts of the lists, and with `fill` the lists too.
 
-    Each column of voxels around a cell has a front: its first cell not below the reach. As the
-    cells rise so do their fronts, so all cells together cost one sweep per column.
+    For each column of voxels around a cell, `front` is its first cell not below the reach. Cells
+    come in rising order, so fronts only move up: all cells together cost one sweep per column.
     """
     columns = (2 * reach[0] + 1) * (2 * reach[1] + 1)
     front = np.zeros(columns, np.int64)

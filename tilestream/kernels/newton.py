@@ -1,4 +1,4 @@
-"""One Newton step of the registration: gradient, Hessian and the two solvers of definitions, 5.
+"""One Newton step of the registration: gradient, Hessian, two solvers (definitions, section 5.1).
 
 A step is (tau, w) [m, rad]: t <- t + tau, R <- Exp(w) R, about the scan's origin. A scan point
 r = R p moves by J = [I, -[r]_x]. With f = B q (q from the cell's mean to the point, B the inverse
@@ -28,7 +28,7 @@ SUMS = 33
 ROTATION_SCALE = 0.1
 """D of the definite solver: a radian counts as 10 m."""
 LEAST_CURVATURE = 1e-6
-"""Least |eigenvalue| that the definite solver divides by, as a share of the largest."""
+"""Smallest |eigenvalue| that the definite solver divides by, as a share of the largest."""
 SINGULAR = 1e-12
 """The raw solver calls a matrix singular below this ratio of its pivots."""
 
@@ -59,11 +59,11 @@ def assemble(sums: Float64, g: Float64, H: Float64) -> None:
 
 @njit(nogil=True, error_model="numpy")
 def to_euler(axes: Float64, g: Float64, H: Float64) -> None:
-    """Turn a gradient and Hessian for R <- Exp(w) R into those for the angles of R = Rx Ry Rz.
+    """Convert a gradient and Hessian for R <- Exp(w) R to the angles of R = Rx Ry Rz, in place.
 
-    The columns a_i of `axes` are ex, Rx ey, Rx Ry ez: w = A (angles' rates). The second derivative
-    a_i x (a_j x r), i the outer angle, differs from its symmetric part by (a_i x a_j) x r / 2:
-    H_ij = a_i . H_w a_j + g_w . (a_i x a_j) / 2 for i < j.
+    The columns a_i of `axes` are ex, Rx ey, Rx Ry ez: w = A (rates of the angles). The second
+    derivative a_i x (a_j x r), i the outer angle, differs from its symmetric part by (a_i x a_j) x
+    r / 2: H_ij = a_i . H_w a_j + g_w . (a_i x a_j) / 2 for i < j.
     """
     old_g, old_H = g.copy(), H.copy()
     for i in range(3):
@@ -163,7 +163,7 @@ def eigen6(A: Float64, V: Float64) -> None:
 
 @njit(nogil=True, error_model="numpy")
 def definite_step(g: Float64, H: Float64, step_max: float, d: Float64) -> float:
-    """Newton step (6,) into `d` that always climbs; its norm.
+    """Newton step (6,) that always increases the score, into `d`; returns its norm.
 
     H_s = D H D, D = diag(1, 1, 1, 1/10, 1/10, 1/10); each eigenvalue e of H_s becomes
     -max(|e|, 1e-6 max|e|); the step is scaled down to a norm of at most `step_max`.
@@ -189,9 +189,9 @@ def definite_step(g: Float64, H: Float64, step_max: float, d: Float64) -> float:
 
 @njit(nogil=True, error_model="numpy")
 def raw_step(g: Float64, H: Float64, step_max: float, step_min: float, d: Float64) -> float:
-    """Newton step (6,) into `d` as PCL takes it; its norm.
+    """Newton step (6,) as PCL takes it, into `d`; returns its norm.
 
-    H d = -g, the least-squares solution where H is singular; turned round if it descends;
+    H d = -g, the least-squares solution where H is singular; negated if it would lower the score;
     norm = max(min(|d|, step_max), step_min).
     """
     if not _eliminate(H, g, d):
@@ -211,8 +211,8 @@ def raw_step(g: Float64, H: Float64, step_max: float, step_min: float, d: Float6
 def _curved_solve(A, b, floor, lift, V, x):  # type: ignore[no-untyped-def]
     """Solve A x = b by x = V E^-1 V^T b where A = V E V^T, overwriting A, V.
 
-    Eigenvalues below `floor` times the largest magnitude: with `lift`, each counts as
-    max(|e|, that); without, their directions are left out (pseudo-inverse).
+    With `lift` every eigenvalue e counts as max(|e|, `floor` times the largest magnitude); without,
+    directions with |e| below that are left out (pseudo-inverse).
     """
     eigen6(A, V)
     largest = 0.0

@@ -1,7 +1,7 @@
 """Terms of a cell that compare it with its neighbours: PFH (Rusu) and Bhattacharyya.
 
-The lists of neighbours are those of `neighbours_within`: symmetric and in rising order. What a
-pair of cells gives is computed once, from the smaller to the larger number, and shared.
+The lists of neighbours are those of `neighbours_within`: symmetric and in rising order. The value
+of a pair of cells is computed once, from the smaller to the larger row, and shared.
 """
 
 import numpy as np
@@ -12,9 +12,9 @@ from tilestream.kernels.cache import njit
 BINS = 125
 """Bins of a histogram: 5 each of alpha, phi (on [-1, 1]) and theta (on [-pi, pi])."""
 SKIPPED = 255
-"""The bin of a pair that does not count."""
+"""The bin of a pair that is skipped."""
 UNKNOWN = 254
-"""A pair that was not looked at yet."""
+"""The bin of a pair that is not computed yet."""
 
 
 @njit(nogil=True, error_model="numpy", inline="always")
@@ -25,7 +25,7 @@ def _fifth(x, low, width):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, error_model="numpy", inline="always")
 def _snapped(x):  # type: ignore[no-untyped-def]
-    """0 for magnitudes below 1e-9: on exact planes rounding would choose between -pi and pi."""
+    """0 for magnitudes below 1e-9: on exact planes rounding would decide between -pi and pi."""
     return 0.0 if abs(x) < 1e-9 else x
 
 
@@ -69,10 +69,10 @@ def pfh_counts(
     start: NDArray[np.int64],
     near: NDArray[np.int32],
 ) -> NDArray[np.int32]:
-    """Pairs per bin over all unordered pairs of {cell + its neighbours} (definitions, section 3).
+    """Pairs per bin over all unordered pairs of {cell + its neighbours} (definitions, section 3.1).
 
-    A pair (i, j) counts for every cell c that has both in its set, and c then is in the sets of
-    both: so for each i, walk the c in its set, and the j > i in theirs.
+    A pair (i, j) counts for every cell c whose set has both, and c is then in the sets of both. So
+    for each i, loop over the c in its set, and over the j > i in the set of c.
 
     Args:
         mean: (m, 3) means [m], any common origin.

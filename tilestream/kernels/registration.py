@@ -1,7 +1,8 @@
-"""3D-NDT registration of a scan from many starts: Newton steps until one is short (definitions, 5).
+"""3D-NDT registration of a scan from many starts: Newton steps until one is short (definitions,
+section 5.1).
 
-What a start ends with does not depend on the starts before it: slots either hold what an anchor
-alone decides, or are forgotten before a start.
+The result of a start does not depend on the starts before it: the content of a slot is decided by
+its bucket alone, or is cleared before each start.
 """
 
 import math
@@ -20,35 +21,35 @@ Int32 = NDArray[np.int32]
 Int64 = NDArray[np.int64]
 
 NO_SCORE = 1.0e-3
-"""Below this sum of densities it is worth counting whether a scan hits any cell."""
+"""Only below this sum of densities a step checks whether the scan still hits any cell."""
 SMALL_ANGLE = 1.0e-4
 """Euler angles below this [rad] count as 0 in the derivatives, as in PCL and Autoware."""
 
 
 class LocalMap(NamedTuple):
-    """The cells around a scan, as the kernel reads them. Anchors: see kernels/anchors.py."""
+    """The cells around a scan, as the kernel reads them (buckets: kernels/neighbour_lists.py)."""
 
     shape: Int64
-    """(3,) number of anchors of the dense grid."""
+    """(3,) number of buckets of the dense grid."""
     edge: float
-    """Edge of an anchor [m]."""
+    """Edge of a bucket [m]."""
     first: Int32
-    """(anchors + 1,) where the list of an anchor begins in `cell` and `shift`."""
+    """(buckets + 1,) where the list of a bucket begins in `cell` and `shift`."""
     cell: Int32
     """(entries,) rows of `table`."""
     shift: Int32
-    """(entries,) packed shifts from the anchor to the cell's corner [anchor edges]."""
+    """(entries,) packed shifts from the bucket to the cell's corner [bucket edges]."""
     table: Float32
     """(cells, 9) mean from the cell's corner [m], inverse covariance xx xy xz yy yz zz times
     d2 / 2 log2(e) [1/m^2]."""
     reach: float
-    """Radius within which a cell counts [m]; 0 where the anchor's list decides alone."""
+    """Radius within which a cell counts [m]; 0: every cell that the bucket lists counts."""
     d1: float
     """Magnusson's d1 < 0, no unit."""
 
 
 class Rule(NamedTuple):
-    """How to step; see RegistrationSettings."""
+    """How to step: fields of `RegistrationSettings`, lengths [m], angles [rad]."""
 
     definite: bool
     euler: bool
@@ -58,12 +59,13 @@ class Rule(NamedTuple):
 
 
 class Aligned(NamedTuple):
-    """What `align` fills, a row per start."""
+    """Input and output of `align`, a row per start."""
 
     R: Float64
-    """(k, 3, 3) rotations; in: the starts'."""
+    """(k, 3, 3) rotations: in, of the starts; out, final."""
     t: Float64
-    """(k, 3) translations from the corner of the start's anchor [m]; in: the starts'."""
+    """(k, 3) translations from the corner of the start's bucket [m]: in, of the starts; out,
+    final."""
     converged: NDArray[np.bool_]
     """(k,) whether the last step was shorter than epsilon."""
     iterations: Int64
@@ -129,7 +131,7 @@ def _newton_step(rule, axes, g, H, d):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, error_model="numpy")
 def _move(rule, d, angles, R, t, axes):  # type: ignore[no-untyped-def]
-    """Apply a step to a pose."""
+    """Apply the step `d` to a pose: R, t (and the Euler angles and axes), in place."""
     for i in range(3):
         t[i] += d[i]
     if rule.euler:
@@ -142,7 +144,7 @@ def _move(rule, d, angles, R, t, axes):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, error_model="numpy")
 def _scale(sums: Float64, d1: float) -> None:
-    """Give the sums of kernels/slots.py their constants (see kernels/newton.py)."""
+    """Multiply the sums of kernels/slots.py with their constants, in place (kernels/newton.py)."""
     for k in range(SUMS + 1):
         sums[k] *= -d1 * LN4 if M <= k < SUMS else -d1
 
@@ -153,12 +155,12 @@ def align(points, corner, local, rule, seven, limit, state, out):  # type: ignor
 
     Args:
         points: (3, n) scan in the lidar frame [m], float64.
-        corner: (k, 3) the anchor, on the local grid, that `out.t` of each start counts from.
+        corner: (k, 3) the bucket, on the local grid, that `out.t` of each start counts from.
         local: the cells around the scan (a `LocalMap`).
         rule: how to step (a `Rule`).
         seven: None for one slot per point, True for seven.
         limit: None, or the squared reach [m^2], float32.
-        state: slots for n points, as `seven` says.
+        state: slots for n points, one or seven per row as `seven` says; scratch memory.
         out: starts in, results out.
     """
     slots = np.uint64(1) if seven is None else np.uint64(7)

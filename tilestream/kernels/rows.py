@@ -1,4 +1,4 @@
-"""Three columns of a record to points, leaving out what is not finite."""
+"""Three columns of a record as points, without those that are not finite."""
 
 from typing import Any
 
@@ -25,8 +25,8 @@ def finite_points(
         z: (n,) coordinates.
         scale: (3,) metres per stored unit, finite.
         offset: (3,) coordinates of the stored origin [m], finite.
-        points: (n, 3) float64 [m], overwritten: the rows without NaN or infinity; what is behind
-            the returned number of rows is arbitrary.
+        points: (n, 3) float64 [m], overwritten: the rows without NaN or infinity; rows
+            beyond the returned number are arbitrary.
     """
     kept = 0
     for i in range(x.shape[0]):

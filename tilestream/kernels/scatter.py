@@ -1,6 +1,6 @@
 """Points to whole millimetres, and to the tiles that own them.
 
-The lattice is that of the definitions, section 1: floor division of millimetres.
+The lattice is that of definitions, section 1: floor division of millimetres.
 """
 
 import numpy as np
@@ -34,7 +34,7 @@ def round_to_mm(points, limits_mm, out):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, inline="always")
 def mix(z):  # type: ignore[no-untyped-def]
-    """The finaliser of splitmix64: 64 bits in, 64 well mixed bits out."""
+    """The mixing function of splitmix64: a 64-bit hash of 64 bits."""
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return z ^ (z >> np.uint64(31))
@@ -76,10 +76,11 @@ def tile_of_points(points_mm, tile_mm, ix_lo, iy_lo, rows, tile_of, counts):  # 
 
 @njit(nogil=True, error_model="numpy")
 def group_by_tile(points_mm, tile_of, tile_mm, ix_lo, iy_lo, rows, next_row, out, prints):  # type: ignore[no-untyped-def]
-    """Copy the points tile by tile, relative to their tile's origin, and fingerprint each tile.
+    """Copy the points tile by tile, relative to their tile's origin, and add up each tile's
+    fingerprint.
 
-    The fingerprint of a set of points is the sum, modulo 2^64, of a 64-bit hash of each point, and
-    a second such sum of other hashes: the same for any order and any split into blocks.
+    The fingerprint of a set of points is two sums, modulo 2^64, each of a different 64-bit hash of
+    every point: the same for any order and any split into blocks.
 
     Args:
         points_mm: (n, 3) int64 [mm].

@@ -1,18 +1,18 @@
 """The score of a cell's points when all of them are shifted: the sums behind `score_H` (eq. 12).
 
-Each point x meets 441 shifts v, and each x + v the cell whose mean is nearest to it. What makes
-that cheap, without changing which cell is found:
+Each point x is moved by 441 shifts v, and each x + v is scored against the cell whose mean is
+nearest. What makes this fast, without changing which cell is found:
 
 * The points of a cell are taken in groups that lie together, the shifts in blocks. Which of two
-  means is nearer is linear in x + v: one that is farther than another at all corners of the box
-  that a group fills in a block is out of the question there. Mostly one to four remain.
-* |x + v - mu|^2 - |v|^2 - 2 v.x is A(x) + T(v): both are rounded to whole numbers, so comparing is
-  adding integers. Each cell is set back by more than the rounding for its place in the list, so
-  that of two equally near ones the lexicographically first is found.
+  means is nearer is linear in x + v: a mean that is farther than another one at all corners of the
+  box that a group covers in a block cannot be the nearest there. Mostly one to four remain.
+* |x + v - mu|^2 - |v|^2 - 2 v.x is A(x) + T(v): both are rounded to whole numbers, so a comparison
+  is an addition of integers. Each cell's distance is increased by its place in the list times more
+  than the rounding error, so that of equally near cells the lexicographically first is found.
 * As a function of v the Mahalanobis form is (U1 + G1.v)^2 + (U2 + G2.v)^2 + U3, along the steep
   and the flat horizontal axis of the cell; scaled, it is an exponent of 2. A block where it is
-  beyond 25 for all cells and points gives 0 without looking.
-* Values are whole multiples of 2^-24 and sums exact, so neither order nor tiling shows.
+  above 25 for all cells and points gives 0 and is skipped.
+* Values are whole multiples of 2^-24 and sums exact, so order and tiling have no effect.
 """
 
 from typing import NamedTuple
@@ -35,51 +35,54 @@ GROUP = 32
 BLOCK = 3
 """Shifts along each side of a block."""
 CAP = np.float32(31.0)
-"""Exponents stop here, where the value is 0."""
+"""Largest exponent; the value is 0 there."""
 DARK = 25.1
-"""From this exponent on the value is 0, whatever float32 rounds."""
+"""From this exponent on the value is 0, however float32 rounds."""
 ONE = 2.0**24
 """The value 1 as a whole number."""
 SET_BACK = 4.0
-"""Steps by which a cell is set back per place in its list; the rounding is below 2 steps."""
+"""Steps added to a cell's distance per place in its list; the rounding error is below 2 steps."""
 ANY = np.int32(2**31 - 1)
-"""A distance that every cell is nearer than."""
+"""A distance larger than that of any cell."""
 P0, P1, P2 = (np.float32(c * ONE) for c in (0.9999999250634845, -0.693142252591582, 0.240172189236))
 P3, P4, P5 = (np.float32(c * ONE) for c in (-0.0552797225485, 0.00918861169470, -0.000938788322664))
 """2^-f on [0, 1], relative error 8e-8 (least squares, reweighted towards equal errors)."""
 
 
 class Near(NamedTuple):
-    """The cells that matter to a cell, and what a group of its points is to them."""
+    """The cells that can be nearest to a cell's shifted points, with tables for one group of
+    points.
+    """
 
     at: NDArray[np.float64]
     """(3, k) their means, from the cell's corner [m]."""
-    white: NDArray[np.float64]
+    whitening: NDArray[np.float64]
     """(k, 7) their rows of `_horizontal_axes`."""
     slope: NDArray[np.float64]
     """(k, 6) what a step of v in x, in y adds to T, to U1 and to U2."""
     A: NDArray[np.int32]
-    """(k, GROUP) |x - mu|^2 in whole steps, set back."""
+    """(k, GROUP) |x - mu|^2 in whole steps, with the steps of `SET_BACK`."""
     U: NDArray[np.float32]
     """(k, 3 GROUP) U1, U2, U3 of the points, scaled to exponents of 2."""
     span: NDArray[np.float64]
     """(k, 5) least and largest U1 and U2, least U3 over the group."""
     over: NDArray[np.float64]
-    """(k,) by how much a mean is farther than the nearest, at best, in a block [m^2]."""
+    """(k,) smallest excess of a mean's squared distance over the nearest one's in a block [m^2]."""
     alive: NDArray[np.int64]
     """(k,) which of them can be nearest in a block."""
 
 
 class Lanes(NamedTuple):
-    """A group of points, and the state of its search in a block of shifts."""
+    """A group of points, one per SIMD lane, and the state of its search in a block of shifts."""
 
     x: NDArray[np.float64]
     """(3, GROUP) points from the cell's corner [m]."""
     pull: NDArray[np.int32]
-    """(2, 2 GROUP) what a step of v in x, in y takes from the distance limit, in whole steps; row
-    0 where the limit does not matter: nothing."""
+    """(2, 2 GROUP) what a step of v in x, in y subtracts from the distance limit, in whole steps;
+    row 0, for blocks where the limit cannot matter: 0."""
     base: NDArray[np.int32]
-    """(2, SIDE, SIDE) the distance limit of each shift without that; row 0: none."""
+    """(2, SIDE, SIDE) the distance limit of each shift before `pull` is subtracted; row 0: no
+    limit."""
     least: NDArray[np.int32]
     """(GROUP,) distance of the nearest cell so far, in whole steps."""
     exponent: NDArray[np.float32]
@@ -107,7 +110,7 @@ def _at_shift(slope, k, i, j):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, error_model="numpy", inline="always")
 def _limit(pull, limited, limit, p, i, j):  # type: ignore[no-untyped-def]
-    """The distance from which on there is no cell for point p at the shift (i, j)."""
+    """The distance from which on point p has no cell at the shift (i, j), in whole steps."""
     return np.int32(limit - np.int32(i * pull[limited, p]) - np.int32(j * pull[limited, p + GROUP]))
 
 
@@ -221,9 +224,9 @@ def _sum_of_many(A, U, slope, alive, count, pull, base, limited, i0, j0, total, 
 
 @njit(nogil=True, error_model="numpy", boundscheck=False)
 def _by_place(offset, cell_size):  # type: ignore[no-untyped-def]
-    """An order of a cell's points in which those that follow each other lie together.
+    """An order of a cell's points in which successive points are near one another.
 
-    By the Morton number of their sixty-fourth of the cell; equal ones in any order.
+    By the Morton code of the 4 x 4 x 4 parts of the cell.
     """
     n = len(offset)
     code, start = np.empty(n, np.int64), np.zeros(65, np.int64)
@@ -245,7 +248,7 @@ def _by_place(offset, cell_size):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, error_model="numpy")
 def _horizontal_axes(precision, covariance, bits):  # type: ignore[no-untyped-def]
-    """The Mahalanobis form of each cell, taken apart so that shifts enter two squares only.
+    """The Mahalanobis form of each cell as a sum of squares, of which shifts change only two.
 
     With G = Sigma'^-1 and w the horizontal part of y, y^T G y = |R (w + s z)|^2 + z^2 / Sigma'_zz,
     where R^T R = G_xx and s = G_xx^-1 G_xz. The rows of R are the eigenvectors of G_xx times the
@@ -254,10 +257,11 @@ def _horizontal_axes(precision, covariance, bits):  # type: ignore[no-untyped-de
     Args:
         precision: (m, 3, 3) inverses of the regularised covariances [1/m^2].
         covariance: (m, 3, 3) regularised covariances [m^2].
-        bits: what makes the form an exponent of 2: d2 / (2 ln 2).
+        bits: factor that makes the form an exponent of 2: d2 / (2 ln 2).
 
     Returns:
-        (m, 7) R row by row, R s, and 1 / Sigma'_zz; the latter times bits, the others its root.
+        (m, 7) R row by row, R s, and 1 / Sigma'_zz; the latter times bits, the others times its
+        root.
     """
     out = np.empty((len(precision), 7))
     for i in range(len(precision)):
@@ -278,7 +282,7 @@ def _horizontal_axes(precision, covariance, bits):  # type: ignore[no-untyped-de
 @njit(nogil=True, error_model="numpy", boundscheck=False)
 def _within_reach(mean, axes, candidates, corner, middle, half, limit, scale, near):  # type: ignore[no-untyped-def]
     """Keep the candidates that some shift brings within the limit of the box; their number."""
-    at, white, slope = near.at, near.white, near.slope
+    at, whitening, slope = near.at, near.whitening, near.slope
     found = 0
     for k in candidates:
         x, y, z = mean[k, 0] - corner[0], mean[k, 1] - corner[1], mean[k, 2] - corner[2]
@@ -289,7 +293,7 @@ def _within_reach(mean, axes, candidates, corner, middle, half, limit, scale, ne
             continue
         at[0, found], at[1, found], at[2, found] = x, y, z
         for a in range(7):
-            white[found, a] = axes[k, a]
+            whitening[found, a] = axes[k, a]
         slope[found, 0] = -2.0 * STEP * scale * x
         slope[found, 1] = -2.0 * STEP * scale * y
         for a in range(4):
@@ -300,7 +304,7 @@ def _within_reach(mean, axes, candidates, corner, middle, half, limit, scale, ne
 
 @njit(nogil=True, error_model="numpy", boundscheck=False)
 def _take_group(offset, members, scale, lanes, middle, half):  # type: ignore[no-untyped-def]
-    """Load the points of a group (the last one again in the lanes left), and their box."""
+    """Load the points of a group (unused lanes repeat the last one) and compute their box."""
     x, pull = lanes.x, lanes.pull
     for a in range(3):
         low, high = np.inf, -np.inf
@@ -316,9 +320,9 @@ def _take_group(offset, members, scale, lanes, middle, half):  # type: ignore[no
 
 @njit(nogil=True, error_model="numpy", boundscheck=False)
 def _tabulate(near, lanes, k, n, scale):  # type: ignore[no-untyped-def]
-    """What the n points of a group are to the k-th cell."""
+    """Fill the tables of the k-th cell for the n points of a group."""
     x, y, z = lanes.x[0], lanes.x[1], lanes.x[2]
-    A, U, w = near.A[k], near.U[k], near.white[k]
+    A, U, w = near.A[k], near.U[k], near.whitening[k]
     w0, w1, w2, w3, w4, w5, w6 = w[0], w[1], w[2], w[3], w[4], w[5], w[6]
     mx, my, mz = near.at[0, k], near.at[1, k], near.at[2, k]
     back = SET_BACK * k
@@ -340,7 +344,7 @@ def _tabulate(near, lanes, k, n, scale):  # type: ignore[no-untyped-def]
     span = near.span
     span[k, 0], span[k, 1], span[k, 2], span[k, 3], span[k, 4] = low1, high1, low2, high2, low3
     for p in range(n, GROUP):
-        U[p + 2 * GROUP] = CAP  # a lane without a point is worth nothing
+        U[p + 2 * GROUP] = CAP  # a lane without a point adds 0
 
 
 @njit(nogil=True, error_model="numpy", boundscheck=False)
@@ -435,7 +439,8 @@ def score_sums(
     d1: float,
     d2: float,
 ) -> NDArray[np.float64]:
-    """Sum over a cell's points x of -d1 p(x + v; c*) for the 441 shifts v (definitions, no. 17).
+    """Sum over a cell's points x of -d1 p(x + v; c*) for the 441 shifts v (definitions,
+    section 3, `score_H`).
 
     p(y; c) = exp(-d2/2 (y - mu)^T Sigma'^-1 (y - mu)); c* is the cell whose mean is nearest to
     x + v, of means within 1e-9 m the lexicographically first; none within l gives 0.
@@ -514,8 +519,8 @@ def score_sums(
 def reach_of_shifts(cell_size: float) -> tuple[int, int, int]:
     """Voxels to each side, in x, y and z, that can hold the nearest cell of a shifted point.
 
-    A shift of 2 m leads to one of the ceil(2 / l) next voxels, and a mean within l of there lies
-    in that voxel or in one of the 26 around it.
+    A shift of 2 m ends at most ceil(2 / l) voxels away, and a mean within l of there lies in that
+    voxel or in one of the 26 around it.
     """
     sideways = int(np.ceil(FARTHEST / cell_size - 1e-9)) + 1
     return sideways, sideways, 1

@@ -1,16 +1,16 @@
-"""The score of a scan and its derivatives as one branch-free reduction over persistent slots.
+"""The score of a scan and its derivatives as one reduction without branches, over cached cells.
 
 Gathering the cells of a point costs more than the arithmetic, and from one Newton step to the next
-few points change their anchor (kernels/anchors.py). So every scan point owns a row of slots that
-holds copies of its cells, and only the points that moved to another anchor are packed again. A
-point with more cells than slots owns further rows behind those of the points.
+few points change their bucket (kernels/neighbour_lists.py). So every scan point owns a row of slots
+that holds copies of its cells, and only points that moved to another bucket are packed again. A
+point with more cells than slots also owns overflow rows, behind the rows of the points.
 
-Layout, so that the reduction reads contiguous float32 and nothing else: rows lie in blocks of
-`BLOCK`, a block is made of lines of one value of every row, `STRIDE` apart (an odd number of cache
-lines, or the lines of a row would fight for the same ones). Nine lines per slot: the cell's mean,
-and its inverse covariance xx xy xz yy yz zz in units where the density is 2^-(q.f). Six lines per
-row: u, the point from its anchor's corner, and r = R p, its lever arm. An empty slot holds a cell
-so far away that its density is nothing.
+Layout, so that the reduction reads contiguous float32 only: rows lie in blocks of `BLOCK`. A block
+is an array of lines; a line holds one value of every row of the block. Lines are `STRIDE` apart, an
+odd number of cache lines: with an even number they would evict each other from the cache. Nine
+lines per slot: the cell's mean, and its inverse covariance xx xy xz yy yz zz in units where the
+density is 2^-(q.f). Six lines per row: u, the point from its bucket's corner, and r = R p, its
+lever arm. An empty slot holds a cell so far away that its density is nothing.
 """
 
 import math
@@ -37,7 +37,7 @@ CELL = 9
 POINT = 6
 """Values of a row: u and r."""
 FAR = 1000.0
-"""Mean of the cell in an empty slot along x [anchor edges]."""
+"""Mean of the cell in an empty slot along x [bucket edges]."""
 LN4 = 2.0 * math.log(2.0)
 """d2 over the factor of the inverse covariances, d2 / 2 log2(e)."""
 
@@ -57,30 +57,30 @@ class Slots(NamedTuple):
     """(blocks * slots * CELL * STRIDE,) the cells of every row."""
     points: Float32
     """(blocks * POINT * STRIDE,) u and r of every row."""
-    anchor: Int32
-    """(n,) the anchor that a point is in."""
+    bucket: Int32
+    """(n,) the bucket that a point is in."""
     packed: Int32
-    """(n,) the anchor that its slots hold; -1 none."""
+    """(n,) the bucket that its slots hold; -1 none."""
     more: Int32
-    """(n,) its first further row; -1 none."""
+    """(n,) its first overflow row; -1 none."""
     owner: Int32
     """(rows,) the point of a row."""
     following: Int32
-    """(rows,) the next further row of the same point, or the next free row; -1 none."""
+    """(rows,) the next overflow row of the same point, or the next free row; -1 none."""
     best: Float32
     """(rows,) the largest density of a row."""
     used: Int64
-    """(3,) rows in use, first free row among them (-1 none), blocks that were initialised."""
+    """(3,) rows in use, first free row among them (-1 none), number of initialised blocks."""
 
 
 def empty_slots(points: int, slots: int, most: int) -> Slots:
-    """Slots for a scan of that many points whose anchors list at most `most` cells."""
+    """Slots for a scan of that many points whose buckets list at most `most` cells."""
     rows = points * max(1, -(-most // slots))
     blocks = -(-rows // BLOCK)
     return Slots(
         cells=np.empty(blocks * slots * CELL * STRIDE, np.float32),
         points=np.zeros(blocks * POINT * STRIDE, np.float32),
-        anchor=np.empty(points, np.int32),
+        bucket=np.empty(points, np.int32),
         packed=np.full(points, -1, np.int32),
         more=np.full(points, -1, np.int32),
         owner=np.zeros(rows, np.int32),
@@ -93,7 +93,7 @@ def empty_slots(points: int, slots: int, most: int) -> Slots:
 if config.DISABLE_JIT:  # type: ignore[attr-defined]
 
     def _wide_vectors() -> None:
-        """Nothing to ask for where nothing is compiled."""
+        """Without the compiler there is nothing to ask for."""
 
 else:
 
@@ -230,10 +230,10 @@ def _reduce(cells, points, blocks, limit, seven, sums):  # type: ignore[no-untyp
 
 
 @njit(nogil=True, error_model="numpy", boundscheck=False, fastmath=EXACT_ENOUGH)
-def _locate(points, R, lever, t, corner, shape, edge, rows, anchor):  # type: ignore[no-untyped-def]
-    """u, r and the anchor of every point.
+def _locate(points, R, lever, t, corner, shape, edge, rows, bucket):  # type: ignore[no-untyped-def]
+    """Compute u, r and the bucket of every point, into `rows` and `bucket`.
 
-    In float64, as x = R p + t [m] from the anchor corner `corner`: u does not lose digits with the
+    x = R p + t [m, from the bucket corner `corner`] is float64, so u does not lose digits with the
     distance from the scan's origin. Points outside the grid fall into its empty border.
     `lever` is None, or another rotation than R to take r from.
     """
@@ -268,7 +268,7 @@ def _locate(points, R, lever, t, corner, shape, edge, rows, anchor):  # type: ig
             ax = min(max(fx + cx, 0.0), top_x)
             ay = min(max(fy + cy, 0.0), top_y)
             az = min(max(fz + cz, 0.0), top_z)
-            anchor[k] = np.int32((ax * ny + ay) * nz + az)
+            bucket[k] = np.int32((ax * ny + ay) * nz + az)
 
 
 @njit(nogil=True, error_model="numpy", boundscheck=False, inline="always")
@@ -288,7 +288,7 @@ def _clear(cells, row, slots, far):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, error_model="numpy", boundscheck=False)
 def _initialise(cells, used, slots, far):  # type: ignore[no-untyped-def]
-    """Fill the blocks in use that never were with empty slots."""
+    """Fill the blocks in use that are not initialised yet with empty slots."""
     while used[2] * BLOCK < used[0]:
         for row in range(np.uint64(used[2]) * _BLOCK, np.uint64(used[2] + 1) * _BLOCK):
             k = _slot(row, slots)
@@ -302,7 +302,7 @@ def _initialise(cells, used, slots, far):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, error_model="numpy", boundscheck=False)
 def _further_row(cells, used, owner, following, more, i, slots, far):  # type: ignore[no-untyped-def]
-    """A row behind those of the points, for point `i` that has more cells than slots."""
+    """An overflow row for point `i`, which has more cells than slots; its number."""
     row = used[1]
     if row >= 0:
         used[1] = following[row]
@@ -318,21 +318,21 @@ def _further_row(cells, used, owner, following, more, i, slots, far):  # type: i
 
 @njit(nogil=True, error_model="numpy", boundscheck=False)
 def _repack(state, local, slots, far):  # type: ignore[no-untyped-def]
-    """Copy the cells of its anchor into the slots of every point that moved to another one.
+    """Copy the cells of its bucket into the slots of every point that moved to another one.
 
-    Means are taken from the anchor's corner, as u is.
+    Means are taken from the bucket's corner, as u is.
     """
-    cells, anchor, packed = state.cells, state.anchor, state.packed
+    cells, bucket, packed = state.cells, state.bucket, state.packed
     more, owner, following, used = state.more, state.owner, state.following, state.used
     first, cell, shift, table = local.first, local.cell, local.shift, local.table
     edge = np.float32(local.edge)
-    for point in range(np.uint64(anchor.size)):
-        a = anchor[point]
+    for point in range(np.uint64(bucket.size)):
+        a = bucket[point]
         if a == packed[point]:
             continue
         packed[point] = a
         row = more[point]
-        while row >= 0:  # free its further rows
+        while row >= 0:  # free its overflow rows
             _clear(cells, np.uint64(row), slots, far)
             after = following[row]
             following[row] = used[1]
@@ -364,9 +364,9 @@ def _repack(state, local, slots, far):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, error_model="numpy", boundscheck=False)
 def _copy_points(state):  # type: ignore[no-untyped-def]
-    """Give further rows the u and r of their point."""
+    """Copy u and r of a point into its overflow rows."""
     points, owner = state.points, state.owner
-    for row in range(np.uint64(state.anchor.size), np.uint64(state.used[0])):
+    for row in range(np.uint64(state.bucket.size), np.uint64(state.used[0])):
         i = np.uint64(owner[row])
         there = (row // _BLOCK) * _6 + row % _BLOCK
         here = (i // _BLOCK) * _6 + i % _BLOCK
@@ -378,8 +378,8 @@ def _copy_points(state):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, error_model="numpy", boundscheck=False)
 def forget_rows(state, slots, far):  # type: ignore[no-untyped-def]
-    """Before a start: what it computes must not depend on where an earlier start left its rows."""
-    n = state.anchor.size
+    """Clear all overflow rows before a start, so that its sums do not depend on earlier starts."""
+    n = state.bucket.size
     if state.used[0] == n:
         return
     for row in range(np.uint64(n), np.uint64(state.used[0])):
@@ -395,7 +395,7 @@ def sums_at(state, points, R, lever, t, corner, local, seven, limit, sums):  # t
     slots = np.uint64(1) if seven is None else np.uint64(7)
     far = np.float32(FAR * local.edge)
     _initialise(state.cells, state.used, slots, far)
-    _locate(points, R, lever, t, corner, local.shape, local.edge, state.points, state.anchor)
+    _locate(points, R, lever, t, corner, local.shape, local.edge, state.points, state.bucket)
     _repack(state, local, slots, far)
     _copy_points(state)
     sums[:] = 0.0
@@ -442,7 +442,7 @@ def best_of_cells(state, slots, limit):  # type: ignore[no-untyped-def]
                 p = _exp2(-(qx * gx + qy * gy + qz * gz))
                 p = p if qx * qx + qy * qy + qz * qz <= limit else _ZERO
                 best[out + i] = max(best[out + i], p)
-    n = state.anchor.size
+    n = state.bucket.size
     for row in range(n, state.used[0]):
         i = state.owner[row]
         best[i] = max(best[i], best[row])

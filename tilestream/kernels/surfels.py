@@ -34,9 +34,9 @@ NORMAL_ONE = 32767
 def _neighbour_sums(points, column, first, rows, reach, wanted, out):  # type: ignore[no-untyped-def]
     """1, x, x x^T over the points within `reach` [mm] of each wanted point.
 
-    x is the offset from that point [mm]: whole numbers, so their order does not show. `points` are
+    x is the offset from that point [mm]: whole numbers, so their order has no effect. `points` are
     sorted by column (`column`, of which there are `rows` to one x; `first` of each), then by z.
-    Going up a column, the lowest neighbour in another one only moves up too.
+    Going up a column, the lowest neighbour in any other column only moves up too.
     """
     limit = reach * reach
     lowest = np.zeros((7, 7), np.int64)
@@ -89,7 +89,9 @@ def _covariances(sums: Int64) -> Float64:
 
 @njit(nogil=True, error_model="numpy")
 def _shape(points, sums, values, vectors, edge, centre, normal, radius):  # type: ignore[no-untyped-def]
-    """Disc or ball, from the principal axes of the points around each point."""
+    """Write the disc or ball of each point, from the principal axes of the points around it;
+    lengths [mm].
+    """
     for i in range(len(sums)):
         middle, least = np.sqrt(values[i, 1]), np.sqrt(values[i, 2])
         flat = sums[i, 0] >= LEAST and least < THICKEST * edge and least < FLATTEST * middle
@@ -120,7 +122,7 @@ def surfels_of(
         points_mm: (n, 3) one point per occupied voxel [mm, map frame], by rising `index`.
         index: (n, 3) voxels, lexicographic.
         edge_mm: edge of a voxel [mm].
-        own: (n,) the voxels whose surfels are wanted; those around them only take part.
+        own: (n,) the voxels whose surfels are wanted; the others only contribute points.
 
     Returns:
         Of the wanted voxels, in their order: (m, 3) centres [mm, map frame]; (m, 3) unit normals,

@@ -1,6 +1,6 @@
 """Points in the order of their lattice voxels, and one point per voxel: the unweighted centroid.
 
-definitions, section 1, "map points": integer sum / count, rounded to 1 mm (half to even), so that
+Map points (definitions, section 1): integer sum / count, rounded to 1 mm (half to even), so that
 the result depends neither on the order nor on the blocks in which the points arrive.
 """
 
@@ -11,7 +11,7 @@ from tilestream.kernels.cache import njit
 
 @njit(nogil=True, error_model="numpy")
 def place_rows(points, keys, next_row, out):  # type: ignore[no-untyped-def]
-    """Copy points to the places of their keys: one pass of a stable counting sort.
+    """Copy points to the rows of their keys: one pass of a stable counting sort.
 
     Args:
         points: (n, 3) int32.
@@ -39,7 +39,7 @@ def rounded_mean(base, total, count):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, error_model="numpy")
 def voxel_end(points, start, edge, corner):  # type: ignore[no-untyped-def]
-    """Where the voxel of a point ends among points in the order of their voxels.
+    """The end of a point's voxel among points that are sorted by voxel.
 
     Args:
         points: (n, 3) int32 [mm], the points of a voxel together.
@@ -48,7 +48,7 @@ def voxel_end(points, start, edge, corner):  # type: ignore[no-untyped-def]
         corner: (3,) int64, receives its lowest corner [mm].
 
     Returns:
-        The first point behind it that lies in another voxel, or n.
+        The row of the first later point in another voxel, or n.
     """
     for axis in range(3):
         corner[axis] = points[start, axis] // edge * edge

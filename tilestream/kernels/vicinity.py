@@ -1,8 +1,8 @@
 """Sums over the vicinity of many sample points (definitions, section 2), as whole numbers.
 
 Everything summed is an integer (counts, or fixed point), so that a sum is the same bits in any
-order: tile after tile, or as the difference to the vicinity of the sample point before. Along a
-route only a few cells in a hundred enter or leave from one point to the next.
+order: tile after tile, or as the difference from the previous sample point's vicinity. Along
+a route only a few percent of the cells enter or leave from one point to the next.
 """
 
 import numpy as np
@@ -12,15 +12,15 @@ from tilestream.kernels.azimuth import azimuth_bin_exactly, is_unsure, turns_gue
 from tilestream.kernels.cache import njit
 
 ONE = 2.0**40
-"""Fixed point of what depends on the place: a share of 1 (r/R, (r/R)^2, u u^T) is this number."""
+"""Fixed point of what depends on the sample point: 1 (of r/R, (r/R)^2, u u^T) is this number."""
 
 N_CELLS, RANGE, RANGE_SQUARED, UXX, UXY, UXZ, UYY, UYZ = range(8)
 """Columns of the sums that depend on the place: 1, r/R, (r/R)^2 and of u u^T, u = (mu - P)/r, all
 but u_z^2 = 1 - u_x^2 - u_y^2."""
 
 AT_PLACE = 1e-9
-"""What is no farther than this from a sample point [m] is at it: at coordinates of 4e6 m float64
-cannot say it better."""
+"""What is no farther than this from a sample point [m] is at it: float64 resolves 1e-9 m at
+coordinates of 4e6 m."""
 
 AZIMUTHS = 90
 """Bins of the azimuths of cells around a sample point."""
@@ -28,7 +28,7 @@ AZIMUTHS = 90
 
 @njit(nogil=True)
 def blocks_of(order_key: NDArray[np.int64], x, y, z):  # type: ignore[no-untyped-def]
-    """Runs of equal keys, and the box of what is in each.
+    """Blocks: runs of equal keys, and their bounding boxes.
 
     Args:
         order_key: (n,) keys, sorted.
@@ -59,7 +59,7 @@ def blocks_of(order_key: NDArray[np.int64], x, y, z):  # type: ignore[no-untyped
 
 @njit(nogil=True, error_model="numpy")
 def _out_of_view(box, place, reach, low, high):  # type: ignore[no-untyped-def]
-    """Whether nothing in a box can be in the vicinity: too far, all above or all below."""
+    """Whether nothing in a box can be in the vicinity: all of it too far, too high or too low."""
     near, far = 0.0, 0.0
     for a in range(3):
         under, over = place[a] - box[a], box[3 + a] - place[a]
@@ -78,9 +78,8 @@ def _out_of_view(box, place, reach, low, high):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, error_model="numpy", boundscheck=False)
 def _view_block(x, y, z, place, reach, low, high, inside, sector, view):  # type: ignore[no-untyped-def]
-    """Which cells of a block are in the vicinity, and their bin of azimuth (others: AZIMUTHS).
-
-    Adds the sums that depend on the place.
+    """Find which cells of a block are in the vicinity (`inside`) and their azimuth bin (`sector`;
+    others: AZIMUTHS), and add the sums that depend on the sample point to `view`.
 
     0 < r <= reach and low <= (mu_z - P_z)/r <= high. One loop without a branch, for the compiler
     to vectorise.
@@ -128,7 +127,7 @@ def _view_block(x, y, z, place, reach, low, high, inside, sector, view):  # type
 
 @njit(nogil=True, boundscheck=False)
 def _enter_or_leave(c, sign, narrow, wide, exponent, bins, sums, wide_sums, counts):  # type: ignore[no-untyped-def]
-    """Add the terms of cell c to a sample point's sums, or take them away."""
+    """Add the terms of cell c to a sample point's sums (`sign` 1), or subtract them (-1)."""
     for j in range(narrow.shape[1]):
         sums[j] += sign * narrow[c, j]
     shift = np.int64(exponent[c])
@@ -164,8 +163,8 @@ def add_cells(
 ) -> None:
     """Add the cells of one tile to the sums of the vicinities of k sample points.
 
-    The sums of terms are written as the change from the sample point before: a cumulative sum over
-    the sample points, once all tiles are in, makes them whole.
+    The sums of terms are written as changes from the previous sample point: take a cumulative sum
+    over the sample points after all tiles are added.
 
     Args:
         places: (k, 3) sample points [m, map frame], best in the order of a route.
@@ -243,14 +242,14 @@ def add_weights(
     weight: NDArray[np.int64],
     out: NDArray[np.int64],
 ) -> None:
-    """Add the weights of what lies in the vicinity of each of k places: plain membership.
+    """Add the weights of what lies in the vicinity of each of k sample points.
 
     Args:
         places: (k, 3) as in `add_cells`.
         reach: as in `add_cells`.
         low: as in `add_cells`.
         high: as in `add_cells`.
-        xyz: (3, n) what has a weight [m, map frame], block by block.
+        xyz: (3, n) positions of the weights [m, map frame], block by block.
         start: (b + 1,) starts of the blocks.
         box: (b, 6) boxes of the blocks.
         weight: (n,) weights.

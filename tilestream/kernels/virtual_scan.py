@@ -1,11 +1,10 @@
 """First returns of beams that are cast at the surfels of a map, voxel by voxel.
 
-The voxels of the surfels stand in bricks of 8 x 8 x 8, the bricks on a dense grid: free space is
-crossed brick by brick. A voxel knows one surfel, the nearest of those that enter it: so a beam
-meets a disc also where it crosses it in the voxel next door. In the voxels that know it a disc is
-its whole plane: so nothing leaks between the points of a wall.
-All that a range is computed from is whole millimetres from the place itself: the same bits for any
-tiling and any origin.
+Voxels are grouped in bricks of 8 x 8 x 8, the bricks lie on a dense grid, and free space is crossed
+brick by brick. A voxel stores one surfel, the nearest of those that enter it; so a beam also meets
+a disc where it crosses it in a neighbouring voxel. In the voxels that store a disc, the disc is its
+whole plane, so that no beam passes between the points of a wall. Ranges are computed from whole
+millimetres relative to the beams' origin: the same bits for any tiling and any map origin.
 """
 
 import math
@@ -26,20 +25,20 @@ BRICK = 8
 VOXELS = BRICK**3
 """Voxels of a brick."""
 OVER = 0.125
-"""How far beside a disc the middle of a voxel may be that it enters [edges]."""
+"""A disc enters a voxel whose centre is at most this far beside it [edges]."""
 HUGE = 1e300
-"""1 / 0, but for 0 times it is 0."""
+"""In place of 1 / 0: 0 times it is 0, not NaN."""
 ROUNDING = 1e-3
-"""What a ray may be off the faces of a box [mm]."""
+"""Tolerance for rounding at the faces of a box [mm]."""
 FREE = -1
-"""A brick without surfels, a voxel without."""
+"""In `grid` and `voxels`: no surfel."""
 X, Y, Z, NX, NY, NZ, RADIUS = range(7)
 """Columns of a surfel: centre from the corner of the grid [mm], unit normal or 0 of a ball, radius
 [mm]. Whole millimetres below 2^24 are exact in float32."""
 
 
 class Bricks(NamedTuple):
-    """Surfels around some places, as the beams find them."""
+    """Surfels around some places, indexed for ray casting."""
 
     edge: int
     """Edge of a voxel [mm]."""
@@ -76,8 +75,9 @@ def mark_bricks(surfels: Float32, edge: int, grid: Int32) -> int:
 
 @njit(nogil=True, error_model="numpy")
 def _closer(surfels, a, b, x, y, z):  # type: ignore[no-untyped-def]
-    """Whether the centre of surfel a is nearer to (x, y, z) than that of b; as near: comes first,
-    lexicographically. All are multiples of half a millimetre: no rounding decides.
+    """Whether the centre of surfel a is nearer to (x, y, z) than that of b; at equal distance:
+    whether it comes first lexicographically. All are multiples of half a millimetre: no rounding
+    decides.
     """
     da = (surfels[a, X] - x) ** 2 + (surfels[a, Y] - y) ** 2 + (surfels[a, Z] - z) ** 2
     db = (surfels[b, X] - x) ** 2 + (surfels[b, Y] - y) ** 2 + (surfels[b, Z] - z) ** 2
@@ -151,9 +151,9 @@ def bound_bricks(edge: int, grid: Int32, voxels: Int32) -> Float32:
 
 @njit(nogil=True, error_model="numpy", boundscheck=False, inline="always")
 def _meet(surfel, px, py, pz, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Range at which a ray from p [mm from the grid's corner] along d meets the plane of a disc, or
-    passes the centre of a ball [mm]; by how much it misses the surfel [mm^2], inf of a ball; cosine
-    of incidence.
+    """Where a ray from p [mm from the grid's corner] along d meets a surfel: the range to the plane
+    of a disc, or to the closest point to a ball's centre [mm]; by how much it misses the surfel
+    [mm^2], inf if it misses a ball; the cosine of incidence.
     """
     x, y, z = np.float64(surfel[X]) - px, np.float64(surfel[Y]) - py, np.float64(surfel[Z]) - pz
     nx, ny, nz = np.float64(surfel[NX]), np.float64(surfel[NY]), np.float64(surfel[NZ])
@@ -172,7 +172,9 @@ def _meet(surfel, px, py, pz, dx, dy, dz):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, error_model="numpy", inline="always")
 def _crossing(position, index, d, size):  # type: ignore[no-untyped-def]
-    """Where a ray leaves the box `index` of an axis, and how far apart such borders are [mm]."""
+    """Range at which a ray leaves box `index` along an axis, and the range from border to border
+    [mm].
+    """
     if d > 0.0:
         return ((index + 1) * size - position) / d, size / d
     if d < 0.0:
@@ -182,14 +184,16 @@ def _crossing(position, index, d, size):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, error_model="numpy", inline="always")
 def _voxel_at(position, brick, edge):  # type: ignore[no-untyped-def]
-    """Voxel of a coordinate [mm] along an axis, kept in its brick, and counted from its corner."""
+    """Voxel of a coordinate [mm] along an axis, counted from its brick's corner, clipped to it."""
     voxel = np.int64(math.floor(position / edge)) - brick * BRICK
     return min(max(voxel, 0), BRICK - 1)
 
 
 @njit(nogil=True, error_model="numpy", boundscheck=False, inline="always")
 def _slab(low, high, position, inverse, t, t_out):  # type: ignore[no-untyped-def]
-    """What of a ray from t to t_out lies between two planes of an axis; a little more."""
+    """The part of a ray's range t to t_out [mm] between two planes of an axis, with a little
+    margin.
+    """
     first = (np.float64(low) - position) * inverse
     second = (np.float64(high) - position) * inverse
     return max(t, min(first, second) - ROUNDING), min(t_out, max(first, second) + ROUNDING)
@@ -256,8 +260,8 @@ def cast(
         bricks: the surfels around the place.
         place_mm: (3,) where the beams start [mm, map frame].
         directions: (n, 3) unit vectors in the map frame.
-        near: surfels nearer than this are not met [mm]: the vehicle itself is there.
-        reach: nor are those farther [mm].
+        near: surfels nearer than this are ignored [mm]: the vehicle itself is there.
+        reach: surfels farther than this are ignored [mm].
         out_range: (n,) receives the ranges [m]; inf where nothing is met.
         out_cosine: (n,) receives the cosines of incidence; 0 where nothing is met.
     """
@@ -332,7 +336,7 @@ def leave_map(
     ranges: Float64,
     reach: float,
 ) -> NDArray[np.bool_]:
-    """Which beams without a return pass over ground of which the map has nothing.
+    """Which beams without a return pass over a column in which the map has nothing.
 
     Args:
         mapped: (nx, ny) columns of the map that hold anything; those beyond hold nothing.

@@ -110,9 +110,13 @@ class SimulationSettings(Settings):
     note: str = ""
     """What a reader of the results must know of them."""
     city: CitySettings = CitySettings()
+    """What stands in the streets."""
     lidar: LidarSettings = LidarSettings()
+    """How the lidar of the drives measures."""
     survey: SurveySettings = SurveySettings()
+    """How the mapping vehicle measures."""
     traffic: TrafficSettings = TrafficSettings()
+    """What moves, and what is not as it was."""
     odometry_error: Length = 0.05
     """Root mean square of the smooth error of the logged odometry [m]."""
     seed: int = 0

@@ -13,7 +13,9 @@ from tilestream.records import Column
 
 JUDGED_COLUMNS = (
     *DATASET_COLUMNS,
-    Column("protocol", "place", "", "Who trains and who judges.", "definitions, 6", dtype="str"),
+    Column(
+        "protocol", "place", "", "Who trains and who judges.", "definitions, section 6", dtype="str"
+    ),
     Column("row", "place", "1", "Row of the dataset that is judged.", "", dtype="int64"),
     Column("fold", "place", "", "What was held out.", "", dtype="str"),
     Column("arc_length", "place", "m", "Length of the route up to here.", ""),

@@ -28,7 +28,11 @@ ERROR_COLUMNS = (
     Column("nvtl", "label", "1", "Mean NVTL at the end.", "Autoware"),
     Column("error_mean", "label", "m", "Mean 3D error of all starts.", "the paper's label"),
     Column(
-        "p_fail", "label", "1", "Share of starts with a 3D error above 0.5 m.", "definitions, 5"
+        "p_fail",
+        "label",
+        "1",
+        "Share of starts with a 3D error above 0.5 m.",
+        "definitions, section 5",
     ),
     Column("mean_held", "label", "m", "Mean 3D error of the starts that did not fail.", ""),
     Column("median_held", "label", "m", "Median of the same.", ""),
@@ -38,7 +42,11 @@ ERROR_COLUMNS = (
     Column("up_mean", "label", "m", "Mean of abs(up).", ""),
     Column("yaw_mean", "label", "rad", "Mean of abs(yaw).", ""),
     Column(
-        "error_floor", "label", "m", "Mean 3D error of the starts within 1 m.", "definitions, 5"
+        "error_floor",
+        "label",
+        "m",
+        "Mean 3D error of the starts within 1 m.",
+        "definitions, section 5",
     ),
     Column("error_tail", "label", "m", "error_mean - error_floor.", "definitions, section 5"),
     Column("status", "place", "", "done, or failed.", "", dtype="str"),

@@ -1,7 +1,7 @@
-"""Which cells a scan point is scored against: a list per voxel of a lattice around the scan.
+"""Neighbour lists: the cells that a scan point is scored against, one list per bucket.
 
-The voxels of this lattice are called anchors. Their edge is the cell size l for direct1 and
-direct7, and l/2 for radius, where an anchor lists every cell that a point in it can reach.
+Buckets are the voxels of a dense grid around the scan. Their edge is the cell size l for direct1
+and direct7. For radius it is l/2, and a bucket lists every cell that any point in it can reach.
 """
 
 import numpy as np
@@ -15,22 +15,23 @@ Int64 = NDArray[np.int64]
 
 
 @njit(nogil=True, error_model="numpy", inline="always")
-def _gap(mean, anchor):  # type: ignore[no-untyped-def]
-    """Distance along an axis from `mean` to the interval [anchor, anchor + 1]."""
-    return max(max(anchor - mean, mean - anchor - 1.0), 0.0)
+def _gap(mean, bucket):  # type: ignore[no-untyped-def]
+    """Distance along an axis from `mean` to the interval [bucket, bucket + 1]."""
+    return max(max(bucket - mean, mean - bucket - 1.0), 0.0)
 
 
 @njit(nogil=True, inline="always")
 def _pack(sx, sy, sz):  # type: ignore[no-untyped-def]
-    """A shift of -8 to 7 anchor edges per axis in 12 bits."""
+    """A shift of -8 to 7 bucket edges per axis in 12 bits."""
     return ((sx + 8) * 16 + sy + 8) * 16 + sz + 8
 
 
 @njit(nogil=True, error_model="numpy")
 def _costs(mean, span, reach, cost):  # type: ignore[no-untyped-def]
-    """Per axis and anchor around a cell's corner: faces away, or the squared gap to its mean.
+    """Fill `cost` (3, 2 span + 1) for one cell: per axis and bucket, the steps from the cell's
+    corner, or with a reach the squared gap to its mean. Returns the budget.
 
-    An anchor lists the cell where the three add up to no more than what this returns.
+    A bucket lists the cell where its three costs add up to no more than the budget.
     """
     for axis in range(3):
         for k in range(2 * span + 1):
@@ -41,7 +42,7 @@ def _costs(mean, span, reach, cost):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, error_model="numpy")
 def _visit(corner, mean, shape, span, reach, count, cursor, cell, shift):  # type: ignore[no-untyped-def]
-    """Count the entries of every anchor, or, where `count` is empty, write them at `cursor`."""
+    """Count the entries of every bucket; where `count` is empty, write the entries at `cursor`."""
     width = 2 * span + 1
     cost = np.empty((3, width))
     for c in range(corner.shape[0]):
@@ -68,21 +69,21 @@ def _visit(corner, mean, shape, span, reach, count, cursor, cell, shift):  # typ
 def neighbour_lists(
     corner: Int64, mean: Float64, shape: Int64, span: int, reach: float
 ) -> tuple[Int32, Int32, Int32]:
-    """The cells of every anchor, as one table in compressed rows.
+    """The cells of every bucket, as one table in compressed sparse rows.
 
-    With reach 0 an anchor lists the cells whose voxel it is, or shares `span` = 1 face with;
+    With reach 0 a bucket lists the cells whose voxel it is, or shares `span` = 1 face with;
     else the cells whose mean lies within `reach` of some point of it.
 
     Args:
-        corner: (m, 3) anchors at the lower corners of the cells, each in [span, shape - span - 1).
-        mean: (m, 3) means of the cells from these corners [anchor edges].
-        shape: (3,) number of anchors of the dense grid.
-        span: how many anchors from its corner a cell can be listed at most.
-        reach: radius [anchor edges]; 0 for the direct modes.
+        corner: (m, 3) buckets at the lower corners of the cells, each in [span, shape - span - 1).
+        mean: (m, 3) means of the cells from these corners [bucket edges].
+        shape: (3,) number of buckets of the dense grid.
+        span: how many buckets from its corner a cell can be listed at most.
+        reach: radius [bucket edges]; 0 for the direct modes.
 
     Returns:
-        first (anchors + 1,), and for each entry from first[a] to first[a + 1] the row of its cell
-        (by rising row) and the packed shift from the anchor to the cell's corner.
+        first (buckets + 1,): the entries of bucket a are first[a] to first[a + 1]. Per entry the
+        row of its cell (rising within a bucket) and the packed shift from bucket to cell corner.
     """
     first = np.zeros(shape[0] * shape[1] * shape[2] + 1, np.int32)
     none = first[:0]
