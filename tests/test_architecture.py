@@ -33,6 +33,7 @@ KNOWN_ONLY_BY = {
     "numba": {"kernels"},
     "open3d": {"simulation", "formats"},
     "typer": {"cli"},
+    "jinja2": {"report"},
 }
 
 

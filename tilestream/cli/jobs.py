@@ -19,7 +19,7 @@ from tilestream.dataflow.main_forecast import forecast
 from tilestream.dataflow.run_settings import RunSettings, read_settings
 from tilestream.errors import LimitError
 from tilestream.report import cards, gate
-from tilestream.report.judgement import MISSING, check_threshold
+from tilestream.report.segments import MISSING, check_threshold
 from tilestream.simulation.settings import load_preset
 
 SHIPPED = resources.files("tilestream") / "data"

@@ -49,8 +49,8 @@ from tilestream.factors.rows import samples_by_tile
 from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.formats.mcap import ScanSelection
 from tilestream.records import TruePose
-from tilestream.report.comparison_page import write_comparison
-from tilestream.report.judgement import check_threshold
+from tilestream.report import write_comparison
+from tilestream.report.segments import check_threshold
 from tilestream.sensors import SENSORS
 from tilestream.store import open_store
 

@@ -24,7 +24,7 @@ from tilestream.forest.intervals import coverage
 from tilestream.forest.models import FORESTS
 from tilestream.forest.training import MAIN, PREDICTION_COLUMNS
 from tilestream.records import Float64
-from tilestream.report.findings import AROUND, Findings
+from tilestream.report.data import AROUND, Findings
 from tilestream.store import POINTS, Tile, TileStore
 from tilestream.tables import read_tables
 

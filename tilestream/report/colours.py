@@ -16,6 +16,8 @@ ACTUAL, AGAIN, HELD_OUT = "#0072b2", "#56b4e9", "#d55e00"
 CRITERION = {"FS": "#0072b2", "RQ": "#e69f00", "LY": "#009e73", "LS": "#cc79a7", "OB": "#56b4e9"}
 """The paper's four criteria, and observability."""
 OTHER = "#7f7f7f"
+CHOICES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", OTHER)
+"""Of the choices that are compared, in turn."""
 CLIP = 0.98
 """Quantile of the estimates at which the colours end: a few lost places must not hide the rest."""
 

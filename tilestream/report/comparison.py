@@ -8,8 +8,8 @@ import pandas as pd
 
 from tilestream.errors import UsageError
 from tilestream.records import Float64
-from tilestream.report.judgement import check_threshold, worst_places
-from tilestream.report.summary import plain
+from tilestream.report.segments import check_threshold, worst_places
+from tilestream.report.summary import by_reason, plain
 from tilestream.version import VERSION
 
 ROW_COLUMNS = (
@@ -84,7 +84,7 @@ class Comparison:
         any_knows = known.any(axis=1)
         size = self.cells.groupby("cell_size")["cells"].sum()
         found = []
-        for choice in _records(self.choices):
+        for choice in self.choices.to_dict("records"):
             part = self.rows[self.rows["choice"] == choice["choice"]]
             here = part["vd_mean"].dropna().to_numpy(np.float64)
             cells = int(size[choice["cell_size"]])
@@ -98,7 +98,7 @@ class Comparison:
                     "max": float(here.max()) if here.size else None,
                     "over_share": float((here > threshold).mean()) if here.size else None,
                     "p_fail": float(part["vd_p_fail"].mean()) if here.size else None,
-                    "missing": _by_reason(part),
+                    "missing": by_reason(part.loc[part["vd_mean"].isna(), "reason"]),
                     "lost": int((any_knows & ~known[choice["choice"]]).sum()),
                     "cells": cells,
                     "map_bytes": cells * CELL_BYTES,
@@ -226,14 +226,3 @@ def _by_choice(rows: pd.DataFrame, column: str) -> pd.DataFrame:
     """A row per sample point, a column per choice, also of choices without any figure."""
     keys = ["route_id", "sample", "choice"]
     return rows.set_index(keys)[column].unstack()  # noqa: PD010 - a pivot_table drops those
-
-
-def _by_reason(rows: pd.DataFrame) -> dict[str, int]:
-    """How many rows have no estimate, by reason, the commonest first."""
-    reasons = rows.loc[rows["vd_mean"].isna(), "reason"].astype(str).replace("", "no reason given")
-    counts = reasons.value_counts()
-    return {str(r): int(counts[r]) for r in sorted(counts.index, key=lambda r: (-counts[r], r))}
-
-
-def _records(table: pd.DataFrame) -> list[dict[str, Any]]:
-    return [{str(k): v for k, v in row.items()} for row in table.to_dict("records")]

@@ -22,8 +22,8 @@ from tilestream.formats.pcd import write_pcd
 from tilestream.formats.rows import writing_whole
 from tilestream.records import Float64
 from tilestream.report.colours import scale_of
-from tilestream.report.findings import Findings, estimates
-from tilestream.report.judgement import segments
+from tilestream.report.data import Findings, estimates
+from tilestream.report.segments import segments
 from tilestream.report.summary import plain, segment
 
 GEOPARQUET = "1.1.0"

@@ -1,4 +1,4 @@
-"""Findings in, a folder out."""
+"""Findings or a comparison in, a folder out."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -10,6 +10,8 @@ from matplotlib.figure import Figure
 from tilestream.errors import TilestreamError
 from tilestream.formats.rows import writing_whole
 from tilestream.report import pictures
+from tilestream.report.comparison import Comparison
+from tilestream.report.data import Findings, estimates
 from tilestream.report.exports import (
     write_cloud,
     write_csv,
@@ -18,11 +20,10 @@ from tilestream.report.exports import (
     write_json,
     write_text,
 )
-from tilestream.report.findings import Findings, estimates
-from tilestream.report.judgement import check_threshold
-from tilestream.report.page import page
+from tilestream.report.formatting import known
+from tilestream.report.page import comparison_page, report_page
+from tilestream.report.segments import check_threshold
 from tilestream.report.summary import plain, summary
-from tilestream.report.words import known
 
 THRESHOLD = 0.25
 """Estimates above this are too large [m]: the paper's, and where Autoware warns."""
@@ -59,9 +60,35 @@ def write_report(
     content["not_in_cloud"] = write_cloud(place / "map.pcd", findings.places)
     worst = _worst(findings, content)
     content["figures"] = _write_figures(place / "figures", findings, worst)
-    write_text(place / "index.html", page(findings, content, worst))
+    write_text(place / "index.html", report_page(findings, content, worst))
     write_json(place / "report.json", content)
     return dict(plain(content))
+
+
+def write_comparison(
+    found: Comparison, folder: str | Path, *, threshold: float, cap: float
+) -> dict[str, Any]:
+    """Write `compare.html` (needs no network), `compare.json` and `compare.csv`, each whole.
+
+    Args:
+        found: what is compared.
+        folder: where to; made where it does not exist.
+        threshold: estimates above this are too large [m].
+        cap: within which the 95 % quantile of a tile's estimates must stay [m].
+
+    Returns:
+        The content of `compare.json`.
+
+    Raises:
+        UsageError: a threshold or cap that is no positive length.
+    """
+    content = found.content(threshold, cap)
+    place = Path(folder)
+    place.mkdir(parents=True, exist_ok=True)
+    write_csv(place / "compare.csv", found.rows)
+    write_text(place / "compare.html", comparison_page(found, content))
+    write_json(place / "compare.json", content)
+    return content
 
 
 def _worst(findings: Findings, content: Mapping[str, Any]) -> dict[int, bytes | str]:
