@@ -28,6 +28,11 @@ def palette() -> list[str]:
     return [mpl.colors.to_hex(colour) for colour in ramp]
 
 
+def to_rgb(colours: list[str]) -> Float64:
+    """(n, 3) red, green and blue of colours, 0 to 1."""
+    return np.asarray(mpl.colors.to_rgba_array(colours))[:, :3]
+
+
 @dataclass(frozen=True)
 class Scale:
     """From an estimate to a colour."""
@@ -46,10 +51,7 @@ class Scale:
 
     def rgb(self, estimate: Float64) -> NDArray[np.uint8]:
         """(n, 3) colours of estimates, grey where there is none."""
-        colours = [*palette(), MISSING]
-        table = np.array([[int(c[k : k + 2], 16) for k in (1, 3, 5)] for c in colours], np.uint8)
-        chosen: NDArray[np.uint8] = table[self.step(estimate)]
-        return chosen
+        return (255.0 * to_rgb([*palette(), MISSING])[self.step(estimate)]).round().astype(np.uint8)
 
 
 def scale_of(estimate: Float64) -> Scale:

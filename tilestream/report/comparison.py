@@ -9,7 +9,7 @@ import pandas as pd
 from tilestream.errors import UsageError
 from tilestream.records import Float64
 from tilestream.report.segments import check_threshold, worst_places
-from tilestream.report.summary import by_reason, plain
+from tilestream.report.summary import by_reason, plain, quantiles
 from tilestream.version import VERSION
 
 ROW_COLUMNS = (
@@ -88,22 +88,18 @@ class Comparison:
             part = self.rows[self.rows["choice"] == choice["choice"]]
             here = part["vd_mean"].dropna().to_numpy(np.float64)
             cells = int(size[choice["cell_size"]])
-            found.append(
-                {
-                    **choice,
-                    "places": len(part),
-                    "estimated": len(here),
-                    "median": float(np.median(here)) if here.size else None,
-                    "p95": float(np.quantile(here, QUANTILE)) if here.size else None,
-                    "max": float(here.max()) if here.size else None,
-                    "over_share": float((here > threshold).mean()) if here.size else None,
-                    "p_fail": float(part["vd_p_fail"].mean()) if here.size else None,
-                    "missing": by_reason(part.loc[part["vd_mean"].isna(), "reason"]),
-                    "lost": int((any_knows & ~known[choice["choice"]]).sum()),
-                    "cells": cells,
-                    "map_bytes": cells * CELL_BYTES,
-                }
-            )
+            figures = {
+                "places": len(part),
+                "estimated": len(here),
+                **quantiles(here),
+                "over_share": float((here > threshold).mean()) if here.size else None,
+                "p_fail": float(part["vd_p_fail"].mean()) if here.size else None,
+                "missing": by_reason(part.loc[part["vd_mean"].isna(), "reason"]),
+                "lost": int((any_knows & ~known[choice["choice"]]).sum()),
+                "cells": cells,
+                "map_bytes": cells * CELL_BYTES,
+            }
+            found.append(dict(choice) | figures)
         return [dict(plain(figures)) for figures in found]
 
     def differing(self, count: int = 10) -> list[dict[str, Any]]:

@@ -61,3 +61,14 @@ def thousands(count: float) -> str:
 def megabytes(size: Any) -> str:
     """A size in memory [bytes]."""
     return f"{size / 1e6:,.1f}{_GLUE}MB".replace(",", "\u202f") if known(size) else DASH
+
+
+def fact(value: Any) -> str:
+    """A setting, a version, a list of them."""
+    if isinstance(value, list):
+        return ", ".join(map(str, value)) or DASH
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return DASH if value is None else str(value)

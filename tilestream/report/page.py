@@ -4,7 +4,7 @@ The same findings give the same bytes.
 """
 
 import base64
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from bokeh.resources import Resources
@@ -42,7 +42,7 @@ def _environment() -> Environment:
     environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
     filters = (
         formatting.cm, formatting.cm_by_name, formatting.percent, formatting.number,
-        formatting.distance, formatting.thousands, formatting.megabytes,
+        formatting.distance, formatting.thousands, formatting.megabytes, formatting.fact,
     )  # fmt: skip
     environment.filters |= {function.__name__: function for function in filters}
     environment.filters["base64"] = lambda data: base64.b64encode(data).decode("ascii")
@@ -68,17 +68,17 @@ def report_page(
     """
     paths = content["paths"][:MOST_CHARTS]
     segments = sorted(content["segments"], key=lambda s: (-s["worst"], s["route_id"], s["begin"]))
+    tip = _ENVIRONMENT.get_template("map_tip.html.j2").render()
     return _render(
         "report.html.j2",
         content,
-        [charts.city_map(found, _text("map_tip.html.j2"))]
+        [charts.city_map(found, tip)]
         + [charts.path_chart(found, path["path"], f"path-{k}") for k, path in enumerate(paths)],
         cards=cards(content),
         routes=_listed_routes(content["routes"]),
         segments=segments[:MOST_SEGMENTS],
         paths=paths,
         pictures=pictures,
-        facts=_facts(content),
         shown_every=charts.map_shows_every(found),
         clip=CLIP,
         bridge=BRIDGE,
@@ -102,7 +102,6 @@ def comparison_page(found: Comparison, content: Mapping[str, Any]) -> str:
         [charts.route_chart(found, name, f"route-{k}") for k, name in enumerate(routes)],
         routes=routes,
         vehicles=[(of, _listed_tiles(of["tiles"])) for of in content["cell_sizes"]],
-        facts=list(_flat("", {"tilestream": content["tilestream"], **content["facts"]})),
         shown_every=charts.line_shows_every(found),
         apart=APART,
         quantile=QUANTILE,
@@ -120,10 +119,6 @@ def _render(
     return page.render(content=content, charts=items, bokeh=bokeh, limit=limit, **more)
 
 
-def _text(template: str) -> str:
-    return _ENVIRONMENT.get_template(template).render()
-
-
 def _listed_routes(routes: list[dict[str, Any]]) -> list[dict[str, Any]]:
     if len(routes) <= MOST_ROUTES:
         return routes
@@ -134,31 +129,3 @@ def _listed_tiles(tiles: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """First those where no size suffices, last those without a sample point."""
     ranked = sorted(tiles, key=lambda t: (t["suffices"] is not False, not t["places"], t["tile"]))
     return ranked[:MOST_TILES]
-
-
-def _facts(content: Mapping[str, Any]) -> dict[str, list[tuple[str, str]]]:
-    """The run facts as tables by title: what stands alone, and each dictionary."""
-    given = {k: v for k, v in content["facts"].items() if k not in ("notes", "attributions")}
-    single = {"tilestream": content["tilestream"], "CRS": content["crs"] or "none: a local frame"}
-    single |= {name: value for name, value in given.items() if not isinstance(value, dict)}
-    tables = {"run": single} | {k: v for k, v in given.items() if isinstance(v, dict)}
-    return {name: list(_flat("", values)) for name, values in tables.items()}
-
-
-def _flat(prefix: str, values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Nested facts as lines, the names joined by dots."""
-    for name, value in values.items():
-        if isinstance(value, dict):
-            yield from _flat(f"{prefix}{name}.", value)
-        else:
-            yield f"{prefix}{name}", _fact(value)
-
-
-def _fact(value: Any) -> str:
-    if isinstance(value, list):
-        return ", ".join(map(str, value)) or formatting.DASH
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return f"{value:.6g}"
-    return formatting.DASH if value is None else str(value)

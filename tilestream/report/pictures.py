@@ -22,6 +22,7 @@ from tilestream.report.colours import (
     OTHER,
     palette,
     scale_of,
+    to_rgb,
 )
 from tilestream.report.data import AROUND, Findings, estimates
 from tilestream.report.formatting import CM_PER_M
@@ -121,8 +122,7 @@ def map_figure(found: Findings) -> Figure:
 
 def _colour_bar(axes: Axes, low: float, high: float) -> None:
     bar = axes.inset_axes((1.02, 0.1, 0.02, 0.8))
-    ramp = np.array([[int(c[k : k + 2], 16) / 255.0 for k in (1, 3, 5)] for c in palette()])
-    bar.imshow(ramp[:, None], origin="lower", aspect="auto",
+    bar.imshow(to_rgb(palette())[:, None], origin="lower", aspect="auto",
                extent=(0.0, 1.0, low * CM_PER_M, high * CM_PER_M))  # fmt: skip
     bar.set(xticks=[], ylabel="estimated error [cm]")
     bar.yaxis.set_label_position("right")

@@ -9,7 +9,7 @@ import pandas as pd
 
 from tilestream.forest.evaluation import PAPER_TABLE, figures
 from tilestream.forest.training import PREDICTION_COLUMNS
-from tilestream.records import Int64
+from tilestream.records import Float64, Int64
 from tilestream.report.data import PLACE_COLUMNS, Findings, estimates, like_training
 from tilestream.report.formatting import cm, distance, known, percent, thousands
 from tilestream.report.lines import held_out_along, interval_factor
@@ -69,9 +69,7 @@ def headline(places: pd.DataFrame, threshold: float) -> dict[str, Any]:
         "routes": int(places["route_id"].nunique()),
         "length": float(reach.sum()),
         "estimated": int(there.sum()),
-        "median": float(np.median(here)) if here.size else None,
-        "p95": float(np.quantile(here, 0.95)) if here.size else None,
-        "max": float(here.max()) if here.size else None,
+        **quantiles(here),
         "over": int(over.sum()),
         "over_share": float(over.sum() / here.size) if here.size else None,
         "over_length": float(reach[over].sum()),
@@ -85,6 +83,14 @@ def headline(places: pd.DataFrame, threshold: float) -> dict[str, Any]:
             for limit in THRESHOLDS
         },
     }
+
+
+def quantiles(errors: Float64) -> dict[str, float | None]:
+    """`median`, `p95` and `max` of errors, all of them known; None of no error."""
+    if not errors.size:
+        return {"median": None, "p95": None, "max": None}
+    median, p95, most = np.quantile(errors, [0.5, 0.95, 1.0]).tolist()
+    return {"median": median, "p95": p95, "max": most}
 
 
 def by_reason(reasons: pd.Series) -> dict[str, int]:
