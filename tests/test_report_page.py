@@ -1,5 +1,6 @@
 """The page: its sections, its chart data, and what a browser makes of it without a network."""
 
+import ast
 import html
 import json
 import re
@@ -26,6 +27,7 @@ from report_findings import (
 )
 from report_json import charts, source
 
+import tilestream.report
 from tilestream.forest.dataset import TARGETS
 from tilestream.forest.models import COMPETITORS
 from tilestream.forest.protocols import PROTOCOLS
@@ -324,6 +326,20 @@ def test_nothing_that_a_file_says_becomes_markup(others: dict[str, Path]) -> Non
     assert "<img src=x" not in source
     assert escape(HOSTILE) in source
     assert charts(others["hostile"])["city-map"]  # no name ends the data early
+
+
+def test_markup_is_in_the_templates_alone() -> None:
+    sources = sorted(Path(tilestream.report.__file__).parent.glob("*.py"))
+    assert len(sources) > 5
+    found = [
+        f"{path.name}:{node.lineno} {node.value!r}"
+        for path in sources
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant)
+        and isinstance(node.value, str)
+        and re.search(r"</?[a-z][a-z0-9]*( [^>]*)?/?>|&[a-z]+;", node.value)
+    ]
+    assert found == []
 
 
 def test_the_page_asks_for_nothing_from_outside(page: Path) -> None:

@@ -103,7 +103,7 @@ class Comparison:
         return [dict(plain(figures)) for figures in found]
 
     def differing(self, count: int = 10) -> list[dict[str, Any]]:
-        """Where the choices differ most, no two places near one another (`judgement.APART`).
+        """Where the choices differ most, no two places near one another (`segments.APART`).
 
         Returns:
             The largest difference first: place, `best` and `worst` (of the choices that have an
@@ -131,7 +131,7 @@ class Comparison:
         A size suffices in a tile if it gives an estimate at every sample point there at which any
         size does, and the 95 % quantile of its estimates stays within the cap. The largest that
         suffices is chosen; where none does, the one that loses the fewest points and then has the
-        lowest quantile; where there is nothing to judge by, the smallest. Each estimate is that of
+        lowest quantile; where there is no estimate, the smallest. Each estimate is that of
         a map of one cell size throughout.
 
         Args:
@@ -200,14 +200,14 @@ def _size_of_tile(rows: pd.DataFrame | None, sizes: dict[float, str], cap: float
     if rows is None:
         return {"places": 0} | finest
     estimate = _by_choice(rows, "vd_mean")
-    judged = estimate[estimate.notna().any(axis=1)]
-    if judged.empty:
+    estimated = estimate[estimate.notna().any(axis=1)]
+    if estimated.empty:
         return {"places": len(estimate)} | finest
     ranked = []
     for cell_size, choice in sizes.items():
-        here: Float64 = judged[choice].dropna().to_numpy(np.float64)
+        here: Float64 = estimated[choice].dropna().to_numpy(np.float64)
         p95 = float(np.quantile(here, QUANTILE)) if here.size else np.inf
-        ranked.append((len(judged) - len(here), p95, cell_size))
+        ranked.append((len(estimated) - len(here), p95, cell_size))
     enough = [(lost, p95, cell) for lost, p95, cell in ranked if lost == 0 and p95 <= cap]
     _, p95, cell_size = max(enough, key=lambda r: r[2]) if enough else min(ranked)
     return {

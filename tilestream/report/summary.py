@@ -62,7 +62,7 @@ def headline(places: pd.DataFrame, threshold: float) -> dict[str, Any]:
     reach = reaches(places)
     over = there & (np.where(there, estimate, 0.0) > threshold)
     like = like_training(places)
-    outside, judged = int((like == "no").sum()), int((like != "not known").sum())
+    outside, compared = int((like == "no").sum()), int((like != "not known").sum())
     missing = places.loc[~there, "reason"]
     return {
         "places": len(places),
@@ -73,8 +73,8 @@ def headline(places: pd.DataFrame, threshold: float) -> dict[str, Any]:
         "over": int(over.sum()),
         "over_share": float(over.sum() / here.size) if here.size else None,
         "over_length": float(reach[over].sum()),
-        "outside": outside if judged else None,
-        "outside_share": outside / judged if judged else None,
+        "outside": outside if compared else None,
+        "outside_share": outside / compared if compared else None,
         "missing": len(missing),
         "missing_share": len(missing) / len(places),
         "missing_by_reason": by_reason(missing),
@@ -171,23 +171,23 @@ def paths(found: Findings) -> list[dict[str, Any]]:
     rows = []
     for name, part in found.labels.groupby("path", sort=True):
         actual, held = (part[c].to_numpy(np.float64) for c in ("error_mean", "held_out"))
-        judged = np.isfinite(actual) & np.isfinite(held)
+        evaluated = np.isfinite(actual) & np.isfinite(held)
         factor = interval_factor(found.coverage, str(name))
         row = {
             "path": str(name),
             "points": len(part),
             "groups": sorted(set(part["group"].astype(str))),
-            "judged": int(judged.sum()),
+            "judged": int(evaluated.sum()),
             "factor": factor,
             "interval": bool(held_out_along(part, factor)["low"].notna().any()),
             "actual_median": float(np.nanmedian(actual)),
-            "estimate_median": float(np.median(held[judged])) if judged.any() else None,
+            "estimate_median": float(np.median(held[evaluated])) if evaluated.any() else None,
             "mae": None,
             "spearman": None,
         }
-        if judged.any():
-            median = np.full(int(judged.sum()), np.median(actual[judged]))
-            of = figures(actual[judged], held[judged], median)
+        if evaluated.any():
+            median = np.full(int(evaluated.sum()), np.median(actual[evaluated]))
+            of = figures(actual[evaluated], held[evaluated], median)
             row |= {"mae": of.mae, "spearman": of.spearman}
         rows.append(row)
     return rows
