@@ -31,6 +31,7 @@ import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
 from tilestream.simulation.city import City, build_city
@@ -57,11 +58,16 @@ COLOURS = {
 }
 
 
+def draw_buildings(ax: Axes, city: City, colour: str) -> None:
+    """The outlines of all buildings."""
+    edges = np.stack([city.footprints.start, city.footprints.end], axis=1)
+    ax.add_collection(LineCollection(list(edges), colors=colour, linewidths=0.4))
+
+
 def district(city: City, path: Path) -> None:
     """Map of the district with the paths coloured by what their stretches are."""
     fig, ax = plt.subplots(figsize=(16, 9.5))
-    edges = np.stack([city.footprints.start, city.footprints.end], axis=1)
-    ax.add_collection(LineCollection(list(edges), colors="0.7", linewidths=0.4))
+    draw_buildings(ax, city, "0.7")
     for street in city.streets:
         ax.plot(*street.xy.T, color="tab:blue" if street.driven else "0.4", lw=2)
         for spot in street.spots:
@@ -125,8 +131,7 @@ def errors(city: City, folder: Path, preset: str, path: Path) -> None:
     fig = plt.figure(figsize=(17, 15))
     grid = fig.add_gridspec(1 + len(driven), 1, height_ratios=(6, *[1] * len(driven)), hspace=0.5)
     ax = fig.add_subplot(grid[0])
-    edges = np.stack([city.footprints.start, city.footprints.end], axis=1)
-    ax.add_collection(LineCollection(list(edges), colors="0.85", linewidths=0.4))
+    draw_buildings(ax, city, "0.85")
     for row, street in enumerate(driven):
         parts = [pd.read_parquet(part) for part in sorted(folder.glob(f"{street.name}/errors/*"))]
         table = pd.concat(parts).query("status == 'done'")

@@ -38,6 +38,7 @@ KNOWN_ONLY_BY = {
     "embreex": {"simulation"},
     "open3d": {"simulation", "apps"},
     "typer": {"cli"},
+    "jinja2": {"report"},
 }
 
 

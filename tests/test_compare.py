@@ -23,8 +23,8 @@ from tilestream.formats.pcd import write_pcd
 from tilestream.formats.routes import route_of
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY
 from tilestream.pipeline.jobs.along_routes import observe_along
+from tilestream.report import write_comparison
 from tilestream.report.comparison import CELL_BYTES, Comparison
-from tilestream.report.comparison_page import write_comparison
 from tilestream.store import cells_table
 from tilestream.tables import read_tables
 

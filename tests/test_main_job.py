@@ -64,7 +64,7 @@ from tilestream.pipeline.stages import predict as predict_stage
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.terms import terms
 from tilestream.report import pictures
-from tilestream.report.evidence import MODELS
+from tilestream.report.evaluation import MODELS
 from tilestream.simulation.settings import load_preset
 
 PIPELINES = Path(__file__).resolve().parents[1] / "pipelines"
@@ -357,7 +357,7 @@ def the_recipe_in_use_is_judged(folder: Path, recipe: str) -> None:
     expected = coverage(judged).set_index("path")["factor"]
     factors = {row["path"]: row["factor"] for row in report["coverage"]}
     assert factors == pytest.approx(expected.to_dict())
-    page = (folder / "report" / "index.html").read_text()
+    page = html.unescape((folder / "report" / "index.html").read_text())
     assert re.search(rf"The model of these estimates \([\d.]+.cm, {MODELS[recipe]}\)", page)
 
 

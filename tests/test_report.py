@@ -35,8 +35,9 @@ from tilestream.report import Findings, gate, write_report
 from tilestream.report.charts import MOST, city_map
 from tilestream.report.colours import MISSING, STEPS, palette, scale_of
 from tilestream.report.exports import write_geoparquet
-from tilestream.report.judgement import BRIDGE, reaches, segments, worst_places
-from tilestream.report.summary import plain, with_gaps
+from tilestream.report.lines import with_gaps
+from tilestream.report.segments import BRIDGE, reaches, segments, worst_places
+from tilestream.report.summary import plain
 
 FILES = (
     "index.html",
@@ -438,7 +439,7 @@ def test_a_page_of_many_places_stays_small(tmp_path: Path) -> None:
 
 def test_of_too_many_places_the_map_shows_the_worst_of_every_few() -> None:
     places = places_of({"a": MOST + 1000, "b": 50})
-    chart = city_map(Findings("t", places))
+    chart = city_map(Findings("t", places), "@route")
     from_chart = json.dumps(chart)
     assert len(from_chart) < 8_000_000
     drawn = [s for s in sources(chart) if s["name"] in ("in_domain", "outside", "missing")]

@@ -1,5 +1,6 @@
 """The page: its sections, its chart data, and what a browser makes of it without a network."""
 
+import ast
 import html
 import json
 import re
@@ -12,6 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from chromium import TIPS, Page, calm, chromium_page, opened, point_at
+from markupsafe import escape
 from report_findings import (
     HOSTILE,
     LIMIT,
@@ -25,22 +27,17 @@ from report_findings import (
 )
 from report_json import charts, source
 
+import tilestream.report
 from tilestream.forest.dataset import TARGETS
 from tilestream.forest.models import COMPETITORS
 from tilestream.forest.protocols import PROTOCOLS
 from tilestream.report import Findings, write_report
 from tilestream.report.charts import path_chart
-from tilestream.report.evidence import (
-    MODELS,
-    PAPER_IMPORTANCES,
-    PARTS,
-    PROTOCOL_NAMES,
-    protocols,
-    table_iv,
-)
-from tilestream.report.judgement import worst_places
-from tilestream.report.page import CONTENTS
-from tilestream.report.words import length, lengths, percent, span
+from tilestream.report.evaluation import MODELS, PAPER_IMPORTANCES, PARTS, PROTOCOL_NAMES
+from tilestream.report.formatting import cm, cm_by_name, cm_span, percent
+from tilestream.report.page import report_page
+from tilestream.report.segments import worst_places
+from tilestream.report.summary import AXES, STARTS, summary
 
 TAGS = re.compile(r"<(script|style)[^>]*>.*?</\1>|<[^>]*>", re.DOTALL)
 
@@ -62,11 +59,17 @@ def others(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {make.__name__: written(make, tmp_path_factory) / "index.html" for make in makes}
 
 
-def text_of(page: Path, section: str) -> str:
-    """What a person reads in a section."""
-    source = page.read_text(encoding="utf-8")
+def text_of(page: Path | Findings, section: str) -> str:
+    """What a person reads in a section of a page, or of the page that findings give."""
+    source = page.read_text(encoding="utf-8") if isinstance(page, Path) else rendered(page)
     (inner,) = re.findall(rf'<section id="{section}">(.*?)</section>', source, re.DOTALL)
     return " ".join(html.unescape(TAGS.sub(" ", inner)).replace("\u202f", " ").split())
+
+
+def rendered(found: Findings) -> str:
+    """The page alone, without pictures of the worst places."""
+    content = summary(found, LIMIT)
+    return report_page(found, content, dict.fromkeys(range(1, 11), "not taken"))
 
 
 @pytest.mark.parametrize("name", ["whole", "without_labels", "one_place", "nothing_estimated"])
@@ -74,8 +77,10 @@ def test_every_section_is_there_in_order_and_says_something(
     name: str, page: Path, others: dict[str, Path]
 ) -> None:
     path = page if name == "whole" else others[name]
-    there = re.findall(r'<section id="([^"]+)">', path.read_text())
-    assert there == [anchor for anchor, _ in CONTENTS]
+    source = path.read_text(encoding="utf-8")
+    there = re.findall(r'<section id="([^"]+)">', source)
+    assert there == re.findall(r'<a href="#([^"]+)">', source)
+    assert len(there) == 9
     for section in there:
         assert len(text_of(path, section)) > 80, section
 
@@ -94,9 +99,10 @@ def test_what_is_empty_says_why(others: dict[str, Path]) -> None:
     assert "No place has an estimate" in text_of(others["nothing_estimated"], "worst")
     assert "no map here 80" in text_of(others["nothing_estimated"], "headline")
     elsewhere = replace(whole(), protocols=pd.DataFrame(), table_iv=pd.DataFrame(), model="")
-    for told in (protocols(elsewhere), table_iv(elsewhere)):
-        assert "Nothing was trained on the labels of this run" in told
-        assert "no labels" not in told
+    for section in ("protocols", "table-iv"):
+        text = text_of(elsewhere, section)
+        assert "Nothing was trained on the labels of this run" in text
+        assert "no labels" not in text
 
 
 def test_the_headline_is_in_figures_that_a_person_reads(found: Findings, page: Path) -> None:
@@ -130,11 +136,10 @@ def test_the_map_holds_every_place_once(found: Findings, page: Path) -> None:
             at = np.array([data["x"][k], data["y"][k]]) + origin
             assert at.tolist() == pytest.approx([place["x"], place["y"]], abs=1e-6)
             assert data["reason"][k] == place["reason"]
-            assert data["interval"][k] == span(place["low"], place["high"])
+            assert data["interval"][k] == cm_span(place["low"], place["high"])
             assert data["fail"][k] == percent(place["p_fail"])
-            axes = {name: place[name] for name in ("along", "across", "up")}
-            assert data["axes"][k] == lengths(axes)
-            assert data["starts"][k] == lengths({"floor": place["floor"], "tail": place["tail"]})
+            assert data["axes"][k] == cm_by_name(place, AXES)
+            assert data["starts"][k] == cm_by_name(place, STARTS)
             if kind == "missing":
                 assert np.isnan(place["estimate"])
                 assert data["domain"][k] == "not known"
@@ -170,7 +175,7 @@ def test_the_path_charts_hold_measured_and_estimated(found: Findings, page: Path
 def test_an_interval_of_the_models_own_goes_before_that_of_the_paths(found: Findings) -> None:
     held = found.labels["held_out"]
     labels = found.labels.assign(low=0.9 * held, high=1.2 * held)
-    data = source(path_chart(replace(found, labels=labels), "II"), "estimate")
+    data = source(path_chart(replace(found, labels=labels), "II", "here"), "estimate")
     kept = np.isfinite(data["arc"])
     np.testing.assert_allclose(data["low"][kept], 0.9 * data["estimate"][kept])
     np.testing.assert_allclose(data["high"][kept], 1.2 * data["estimate"][kept])
@@ -178,8 +183,8 @@ def test_an_interval_of_the_models_own_goes_before_that_of_the_paths(found: Find
 
 def test_table_iv_names_the_model_where_there_are_several(found: Findings) -> None:
     two = pd.concat([found.table_iv, found.table_iv.assign(model="default")])
-    text = " ".join(TAGS.sub(" ", table_iv(replace(found, table_iv=two))).split())
-    assert "FS+RQ, forest, the paper's setting 1.00" in html.unescape(text)
+    text = text_of(replace(found, table_iv=two), "table-iv")
+    assert "FS+RQ, forest, the paper's setting 1.00" in text
     assert "FS+RQ, forest, tuned on held-out blocks 1.00" in text
 
 
@@ -189,7 +194,7 @@ def test_the_worst_places_are_told_in_words_and_pictures(found: Findings, page: 
         place = found.places.iloc[row]
         start = f"{number} {place['route_id']} , {place['arc_length']:.0f} m along"
         assert start in text
-        assert length(place["estimate"]).replace("\u00a0", " ") in text
+        assert cm(place["estimate"]).replace("\u00a0", " ") in text
     assert page.read_text().count('src="data:image/png;base64,') == 10
 
 
@@ -222,7 +227,7 @@ def test_the_protocols_say_who_wins(page: Path, tmp_path: Path) -> None:
     text = text_of(tmp_path / "index.html", "protocols")
     assert "(2.00 cm, forest, the paper's setting) does not beat the best opponent (0.10" in text
     assert "Better here" not in text
-    elsewhere = html.unescape(TAGS.sub(" ", protocols(replace(whole(), model=""))))
+    elsewhere = text_of(replace(whole(), model=""), "protocols")
     assert "beat" not in elsewhere.replace("must beat", "").replace("it beats the opponents", "")
 
 
@@ -238,11 +243,11 @@ def test_the_parts_of_the_error_are_judged_beside_a_repeated_drive(page: Path) -
     assert "share of the starts that fail forest, tuned on held-out blocks 1.00 % 0.40" in parts
     assert parts.endswith(f"{again} 2.10 % 0.70 0.81")
     assert parts.count(again) == 1  # the ceiling of the others is not known
-    alone = html.unescape(TAGS.sub(" ", protocols(replace(whole(), parts=pd.DataFrame()))))
+    alone = text_of(replace(whole(), parts=pd.DataFrame()), "protocols")
     assert "Not judged in this run." in alone
     same = whole().parts.replace({"target": {"error_tail": "error_floor"}})
     same.loc[same["target"] == "error_floor", ["mae", "reason"]] = [np.nan, "all are 0"]
-    text = " ".join(TAGS.sub(" ", protocols(replace(whole(), parts=same))).split())
+    text = text_of(replace(whole(), parts=same), "protocols")
     assert "floor: what starts within 1 m end with not followed: all are 0 – – –" in text
 
 
@@ -250,14 +255,14 @@ def test_the_parts_stand_below_the_estimate_of_a_worst_place(found: Findings, pa
     place = found.places.iloc[worst_places(found.places)[0]]
     axes = ", ".join(f"{name} {100 * place[name]:.1f}" for name in ("along", "across", "up"))
     starts = ", ".join(f"{name} {100 * place[name]:.1f}" for name in ("floor", "tail"))
-    estimate = length(place["estimate"]).replace("\u00a0", " ")
+    estimate = cm(place["estimate"]).replace("\u00a0", " ")
     text = text_of(page, "worst").replace("\u00a0", " ")
     assert f"{estimate} {axes} cm {starts} cm" in text
 
 
 def test_lengths_leave_out_what_is_not_known() -> None:
-    assert lengths({"floor": 0.021, "tail": float("nan")}) == "floor 2.1\u00a0cm"
-    assert lengths({"floor": None}) == "none"
+    assert cm_by_name({"floor": 0.021, "tail": float("nan")}, STARTS) == "floor 2.1\u00a0cm"
+    assert cm_by_name({"floor": None}, STARTS[:1]) == "none"
 
 
 def test_without_training_no_place_is_called_like_or_unlike(
@@ -319,8 +324,22 @@ def test_nothing_that_a_file_says_becomes_markup(others: dict[str, Path]) -> Non
     source = others["hostile"].read_text(encoding="utf-8")
     assert "<script>fail()" not in source
     assert "<img src=x" not in source
-    assert html.escape(HOSTILE) in source
+    assert escape(HOSTILE) in source
     assert charts(others["hostile"])["city-map"]  # no name ends the data early
+
+
+def test_markup_is_in_the_templates_alone() -> None:
+    sources = sorted(Path(tilestream.report.__file__).parent.glob("*.py"))
+    assert len(sources) > 5
+    found = [
+        f"{path.name}:{node.lineno} {node.value!r}"
+        for path in sources
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant)
+        and isinstance(node.value, str)
+        and re.search(r"</?[a-z][a-z0-9]*( [^>]*)?/?>|&[a-z]+;", node.value)
+    ]
+    assert found == []
 
 
 def test_the_page_asks_for_nothing_from_outside(page: Path) -> None:

@@ -19,7 +19,7 @@ from tilestream.pipeline.jobs import simulate as simulation
 from tilestream.pipeline.jobs.forecast import forecast
 from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
 from tilestream.report import cards, gate
-from tilestream.report.judgement import MISSING, check_threshold
+from tilestream.report.segments import MISSING, check_threshold
 from tilestream.simulation.settings import load_preset
 
 SHIPPED = resources.files("tilestream") / "data"

@@ -51,8 +51,8 @@ from tilestream.pipeline.stages.drive_scans import Reading
 from tilestream.pipeline.stages.factors import Looking
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.records import TruePose
-from tilestream.report.comparison_page import write_comparison
-from tilestream.report.judgement import check_threshold
+from tilestream.report import write_comparison
+from tilestream.report.segments import check_threshold
 from tilestream.sensors import SENSORS
 from tilestream.store import open_store
 

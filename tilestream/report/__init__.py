@@ -1,14 +1,15 @@
 """The way out: what a run found, as one page for people and as files for programs.
 
 ```
-findings --> judgement (segments, worst places) --> summary --+--> exports (parquet, geojson, …)
-                                                              +--> charts, pictures --> page
+data (Findings) --> segments (worst places) --> summary --+--> exports (parquet, geojson, …)
+                                                          +--> charts, pictures --> page --> HTML
+comparison (Comparison) ----------------------------------+                (templates/)
 ```
 """
 
-from tilestream.report.findings import Findings
-from tilestream.report.judgement import gate
-from tilestream.report.places import cards
-from tilestream.report.write import write_report
+from tilestream.report.data import Findings
+from tilestream.report.segments import gate
+from tilestream.report.summary import cards
+from tilestream.report.write import write_comparison, write_report
 
-__all__ = ["Findings", "cards", "gate", "write_report"]
+__all__ = ["Findings", "cards", "gate", "write_comparison", "write_report"]

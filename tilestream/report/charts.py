@@ -1,6 +1,6 @@
 """The charts that answer to the mouse: Bokeh documents as plain JSON, the same bytes every time."""
 
-from collections.abc import Mapping, Sequence
+import itertools
 from typing import Any
 
 import numpy as np
@@ -19,42 +19,68 @@ from bokeh.models.renderers import GlyphRenderer
 from bokeh.plotting import figure
 from numpy.typing import NDArray
 
-from tilestream.records import Float64
-from tilestream.report.colours import ACTUAL, AGAIN, HELD_OUT, MISSING, palette, scale_of
-from tilestream.report.findings import Findings, estimates, like_training
-from tilestream.report.judgement import worst_places
-from tilestream.report.summary import AXES, STARTS, held_out_along, interval_factor, with_gaps
-from tilestream.report.words import CM_PER_M, length, lengths, percent, span
+from tilestream.records import Float64, Int64
+from tilestream.report.colours import (
+    ACTUAL,
+    AGAIN,
+    CHOICES,
+    HELD_OUT,
+    MISSING,
+    palette,
+    scale_of,
+)
+from tilestream.report.comparison import Comparison
+from tilestream.report.data import Findings, estimates, like_training
+from tilestream.report.formatting import CM_PER_M, cm, cm_by_name, cm_span, percent
+from tilestream.report.lines import path_lines, points_per_mark, with_gaps, worst_of_every
+from tilestream.report.segments import worst_places
+from tilestream.report.summary import AXES, STARTS
 
 MOST = 20_000
 """Places drawn on the map; of more, the worst of every few along a route."""
+MOST_POINTS = 2_000
+"""Points of a line; of more, the worst of every few."""
 MAP_TOOLS = "pan,wheel_zoom,box_zoom,reset,save"
-PATH_TOOLS = "xpan,xwheel_zoom,xbox_zoom,reset"
+ROAD_TOOLS = "xpan,xwheel_zoom,xbox_zoom,reset"
 PATH_TIP = [
     ("along", "@arc{0.0} m"),
     ("measured", "@measured"),
     ("estimate", "@shown"),
     ("interval", "@interval"),
 ]
-MAP_TIP = (
-    '<div style="max-width:24em;font:13px system-ui,sans-serif;color:#222">'
-    "<b>@route</b>, @arc{0.0} m along<br>"
-    "estimate <b>@shown</b><br>interval @interval<br>starts that fail: @fail<br>"
-    "@axes<br>@starts<br>like the training places: @domain<br><i>@reason</i></div>"
-)
+ROUTE_TIP = [("choice", "@choice"), ("along", "@arc{0.0} m"), ("estimate", "@shown")]
+DASHES = ("solid", "dashed", "dotted", "dotdash")
+"""Of the lines of a comparison: the next of them after each turn of the colours."""
+NUMBER: dict[str, Any] = {
+    "text_color": "#ffffff",
+    "text_font_size": "11px",
+    "text_font_style": "bold",
+    "text_align": "center",
+    "text_baseline": "bottom",
+    "y_offset": -9,
+    "background_fill_color": "#111111",
+    "border_line_color": "#ffffff",
+    "border_radius": 8,
+    "padding": 4,
+}
+"""How the number of one of the worst places looks."""
 
 
-def city_map(found: Findings) -> dict[str, Any]:
+def city_map(found: Findings, tip: str) -> dict[str, Any]:
     """The sample points coloured by estimate, the worst on top and numbered, as an item for
     `Bokeh.embed.embed_item`.
 
     The data sources are named `in_domain`, `outside`, `unjudged`, `missing` and `worst`.
+
+    Args:
+        found: what is reported.
+        tip: HTML that a point shows under the mouse, with `@` before the name of a column.
     """
     places = found.places
     estimate = estimates(places)
     scale, colours = scale_of(estimate), palette()
-    plot = new_plot(600, "x", "y", MAP_TOOLS, match_aspect=True)
-    drawn = _drawn(places)
+    plot = _new_plot(600, "x", "y", MAP_TOOLS, match_aspect=True)
+    drawn = worst_of_every(map_shows_every(found), places["route_id"], estimate)
     origin = _origin(places)
     kinds = _kinds(places)
     mapper = LinearColorMapper(
@@ -78,7 +104,7 @@ def city_map(found: Findings) -> dict[str, Any]:
         )
         glyphs = plot.scatter("x", "y", source=source, marker=marker, legend_label=name, **style)
         # of the dots under the mouse the worst, which is the one on top
-        plot.add_tools(hover(glyphs, MAP_TIP, sort_by=[("estimate", -1)]))
+        plot.add_tools(_hover(glyphs, tip, sort_by=[("estimate", -1)]))
     _number_the_worst(plot, places, origin)
     if np.isfinite(estimate).any():
         bar = ColorBar(color_mapper=mapper, title="estimated error [cm]", width=12, padding=4)
@@ -88,24 +114,13 @@ def city_map(found: Findings) -> dict[str, Any]:
         f"{axis} − {value:.0f} m" if value else f"{axis} [m]"
         for axis, value in zip("xy", origin, strict=True)
     )
-    finish(plot)
-    return item_of(plot, "city-map")
+    _finish(plot)
+    return _item(plot, "city-map")
 
 
-def shown_every(places: pd.DataFrame) -> int:
+def map_shows_every(found: Findings) -> int:
     """How many consecutive sample points one dot of the map stands for; it shows their worst."""
-    return max(1, int(np.ceil(len(places) / MOST)))
-
-
-def _drawn(places: pd.DataFrame) -> NDArray[np.int64]:
-    """The rows that are drawn, ascending."""
-    every = shown_every(places)
-    if every == 1:
-        return np.arange(len(places))
-    estimate = np.nan_to_num(estimates(places), nan=-1.0)
-    number = places.groupby("route_id").cumcount().to_numpy() // every
-    keys = pd.DataFrame({"route": places["route_id"], "number": number, "estimate": estimate})
-    return np.sort(keys.groupby(["route", "number"])["estimate"].idxmax().to_numpy(np.int64))
+    return points_per_mark(len(found.places), MOST)
 
 
 def _kinds(places: pd.DataFrame) -> NDArray[np.str_]:
@@ -122,12 +137,11 @@ def _origin(places: pd.DataFrame) -> Float64:
     return np.where(np.abs(corner) >= 10_000.0, corner, 0.0)
 
 
-def _columns(places: pd.DataFrame, rows: NDArray[np.int64], origin: Float64) -> dict[str, Any]:
+def _columns(places: pd.DataFrame, rows: Int64, origin: Float64) -> dict[str, Any]:
     part = places.iloc[rows]
     estimate = estimates(part)
     share = np.clip(scale_of(estimates(places)).step(estimate), 0, None) / 255.0
-    names = ("low", "high", "p_fail", *AXES, *STARTS)
-    value = {name: part[name].to_numpy(np.float64) for name in names}
+    figures = part[["low", "high", "p_fail", *AXES, *STARTS]].to_dict("records")
     return {
         "x": part["x"].to_numpy(np.float64) - origin[0],
         "y": part["y"].to_numpy(np.float64) - origin[1],
@@ -135,20 +149,14 @@ def _columns(places: pd.DataFrame, rows: NDArray[np.int64], origin: Float64) -> 
         "size": 5.0 + 7.0 * share,
         "route": part["route_id"].astype(str).tolist(),
         "arc": part["arc_length"].to_numpy(np.float64),
-        "shown": [length(e) for e in estimate],
-        "interval": [span(lo, hi) for lo, hi in zip(value["low"], value["high"], strict=True)],
-        "fail": [percent(p) for p in value["p_fail"]],
-        "axes": _told(value, AXES),
-        "starts": _told(value, STARTS),
+        "shown": [cm(e) for e in estimate],
+        "interval": [cm_span(of["low"], of["high"]) for of in figures],
+        "fail": [percent(of["p_fail"]) for of in figures],
+        "axes": [cm_by_name(of, AXES) for of in figures],
+        "starts": [cm_by_name(of, STARTS) for of in figures],
         "domain": like_training(part).tolist(),
         "reason": part["reason"].fillna("").astype(str).tolist(),
     }
-
-
-def _told(value: Mapping[str, Float64], names: Sequence[str]) -> list[str]:
-    """Lengths of each place in words."""
-    rows = zip(*(value[name] for name in names), strict=True)
-    return [lengths(dict(zip(names, row, strict=True))) for row in rows]
 
 
 def _number_the_worst(plot: figure, places: pd.DataFrame, origin: Float64) -> None:
@@ -160,91 +168,36 @@ def _number_the_worst(plot: figure, places: pd.DataFrame, origin: Float64) -> No
         {"x": at[:, 0], "y": at[:, 1], "number": [str(k + 1) for k in range(len(rows))]},
         name="worst",
     )
-    style: dict[str, Any] = {
-        "text_color": "#ffffff",
-        "text_font_size": "11px",
-        "text_font_style": "bold",
-        "text_align": "center",
-        "text_baseline": "bottom",
-        "y_offset": -9,
-        "background_fill_color": "#111111",
-        "border_line_color": "#ffffff",
-        "border_radius": 8,
-        "padding": 4,
-    }
-    plot.text("x", "y", "number", source=source, **style)
+    plot.text("x", "y", "number", source=source, **NUMBER)
 
 
-def path_chart(found: Findings, path: str) -> dict[str, Any]:
+def path_chart(found: Findings, path: str, target: str) -> dict[str, Any]:
     """Measured error and held-out estimate along a path: a line per drive, the interval a band.
 
     The data sources are named by their group, and `estimate`; lengths in centimetres.
     """
-    labels = found.labels[found.labels["path"].astype(str) == path]
-    factor = interval_factor(found.coverage, path)
-    plot = new_plot(280, "along [m]", "error [cm]", PATH_TOOLS, y_range=DataRange1d(start=0))
-    columns = _estimated(labels, factor)
-    _band(plot, columns)
-    drives = list(labels.groupby("group", sort=True))
-    for number, (group, part) in enumerate(drives):
+    plot = _new_road(280, "error [cm]")
+    lines = path_lines(found, path)
+    _band(plot, lines.estimate)
+    for number, (group, columns) in enumerate(lines.measured.items()):
         plot.line(
             "arc",
             "measured",
-            source=ColumnDataSource(_measured(part), name=str(group)),
+            source=ColumnDataSource(columns, name=group),
             color=AGAIN if number else ACTUAL,
             line_width=1.6,
             line_dash=(5, 3) if number else "solid",
-            legend_label=f"measured, {group}" if len(drives) > 1 else "measured",
+            legend_label=f"measured, {group}" if len(lines.measured) > 1 else "measured",
         )
-    source = ColumnDataSource(columns, name="estimate")
-    if np.isfinite(columns["estimate"]).any():
+    source = ColumnDataSource(lines.estimate, name="estimate")
+    if np.isfinite(lines.estimate["estimate"]).any():
         label = "estimate of a model without this path"
         style: dict[str, Any] = {"color": HELD_OUT, "line_width": 1.8, "legend_label": label}
         plot.line("arc", "estimate", source=source, **style)
     anchor = plot.line("arc", "anchor", source=source, line_alpha=0.0)
-    plot.add_tools(hover(anchor, PATH_TIP, mode="vline"))
-    finish(plot)
-    return item_of(plot, f"path-{path}")
-
-
-def _measured(part: pd.DataFrame) -> dict[str, Any]:
-    """A drive along a path; NaN where its line is to be broken."""
-    arc = part["arc_length"].to_numpy(np.float64)
-    breaks = with_gaps(arc)
-    measured = part["error_mean"].to_numpy(np.float64) * CM_PER_M
-    return {
-        "arc": np.insert(arc, breaks, np.nan),
-        "measured": np.insert(measured, breaks, np.nan),
-    }
-
-
-def _estimated(labels: pd.DataFrame, factor: float | None) -> dict[str, Any]:
-    """The estimate at each labelled place of a path, its interval, and what was measured there."""
-    along = held_out_along(labels, factor)
-    arc = along["arc_length"].to_numpy(np.float64)
-    breaks = with_gaps(arc)
-    names = ("held_out", "low", "high", "error_mean")
-    held, low, high, mean = (along[name].to_numpy(np.float64) for name in names)
-    several = len(set(labels["group"])) > 1
-    said: dict[float, list[str]] = {}
-    for where, group, error in zip(
-        labels["arc_length"], labels["group"], labels["error_mean"], strict=True
-    ):
-        said.setdefault(where, []).append(length(error) + (f" ({group})" if several else ""))
-    lengths = {
-        "arc": arc,
-        "estimate": held * CM_PER_M,
-        "low": low * CM_PER_M,
-        "high": high * CM_PER_M,
-        "anchor": np.where(np.isfinite(held), held, mean) * CM_PER_M,
-    }
-    words = {
-        "measured": [", ".join(said[where]) for where in arc],
-        "shown": [length(e) for e in held],
-        "interval": [span(a, b) for a, b in zip(low, high, strict=True)],
-    }
-    columns: dict[str, Any] = {k: np.insert(v, breaks, np.nan) for k, v in lengths.items()}
-    return columns | {k: np.insert(v, breaks, "").tolist() for k, v in words.items()}
+    plot.add_tools(_hover(anchor, PATH_TIP, mode="vline"))
+    _finish(plot)
+    return _item(plot, target)
 
 
 def _band(plot: figure, columns: dict[str, Any]) -> None:
@@ -263,7 +216,50 @@ def _band(plot: figure, columns: dict[str, Any]) -> None:
         )
 
 
-def hover(glyphs: "GlyphRenderer[Any]", tip: Any, **options: Any) -> HoverTool:
+def route_chart(found: Comparison, route_id: str, target: str) -> dict[str, Any]:
+    """The estimates along a route, a line per choice, as an item for `Bokeh.embed.embed_item`.
+
+    The data sources are named after the choices; lengths in centimetres.
+    """
+    plot = _new_road(340, "estimated error [cm]")
+    rows = found.rows[found.rows["route_id"] == route_id]
+    every = line_shows_every(found)
+    styles = itertools.cycle(itertools.product(DASHES, CHOICES))
+    for choice, (dash, colour) in zip(found.choices["choice"], styles, strict=False):
+        columns = _line(rows[rows["choice"] == choice], every)
+        source = ColumnDataSource(columns | {"choice": [choice] * len(columns["arc"])}, name=choice)
+        style: dict[str, Any] = {"color": colour, "line_dash": dash, "line_width": 1.7}
+        line = plot.line("arc", "estimate", source=source, legend_label=choice, **style)
+        # a place between two without an estimate has no line
+        plot.scatter("arc", "estimate", source=source, size=3, color=colour, legend_label=choice)
+        plot.add_tools(_hover(line, ROUTE_TIP, mode="mouse", line_policy="nearest"))
+    _finish(plot)
+    plot.legend.ncols = 4
+    return _item(plot, target)
+
+
+def line_shows_every(found: Comparison) -> int:
+    """How many consecutive sample points one point of a line stands for; it shows their worst."""
+    return points_per_mark(
+        int(found.rows.groupby(["choice", "route_id"]).size().max()), MOST_POINTS
+    )
+
+
+def _line(rows: pd.DataFrame, every: int) -> dict[str, Any]:
+    """A choice along a route; NaN where its line is to be broken."""
+    estimate = rows["vd_mean"].to_numpy(np.float64)
+    worst = worst_of_every(every, rows["route_id"].to_numpy(), estimate)
+    arc, estimate = rows["arc_length"].to_numpy(np.float64)[worst], estimate[worst]
+    breaks = with_gaps(arc) if every == 1 else np.zeros(0, np.int64)
+    shown = np.array([cm(e) for e in estimate], dtype=object)
+    return {
+        "arc": np.insert(arc, breaks, np.nan),
+        "estimate": np.insert(estimate * CM_PER_M, breaks, np.nan),
+        "shown": np.insert(shown, breaks, "").tolist(),
+    }
+
+
+def _hover(glyphs: "GlyphRenderer[Any]", tip: Any, **options: Any) -> HoverTool:
     """Shows what is under the mouse; no button of its own in the toolbar."""
     return HoverTool(
         renderers=[glyphs],
@@ -275,7 +271,12 @@ def hover(glyphs: "GlyphRenderer[Any]", tip: Any, **options: Any) -> HoverTool:
     )
 
 
-def new_plot(height: int, x: str, y: str, tools: str, **options: Any) -> figure:
+def _new_road(height: int, y: str) -> figure:
+    """An empty chart of errors along a road."""
+    return _new_plot(height, "along [m]", y, ROAD_TOOLS, y_range=DataRange1d(start=0))
+
+
+def _new_plot(height: int, x: str, y: str, tools: str, **options: Any) -> figure:
     """An empty chart as wide as the page, its axes named."""
     plot = figure(
         height=height,
@@ -290,7 +291,7 @@ def new_plot(height: int, x: str, y: str, tools: str, **options: Any) -> figure:
     return plot
 
 
-def finish(plot: figure) -> None:
+def _finish(plot: figure) -> None:
     """Calm, and see-through, so that the page's own colours stand behind."""
     plot.background_fill_alpha = plot.border_fill_alpha = 0.0
     plot.outline_line_color = None
@@ -311,35 +312,21 @@ def finish(plot: figure) -> None:
         plot.legend.click_policy = "hide"
 
 
-def item_of(plot: figure, target: str) -> dict[str, Any]:
+def _item(plot: figure, target: str) -> dict[str, Any]:
     """A chart as `Bokeh.embed.embed_item` takes it, to be drawn in the element `target`."""
-    item: dict[str, Any] = json_item(plot, ID(target))  # type: ignore[assignment]
-    found: dict[str, str] = {}
-    _collect(item, found)
-    renamed: dict[str, Any] = _renamed(item, found)
-    return renamed
+    item: dict[str, Any] = _renumbered(json_item(plot, ID(target)), {})
+    return item
 
 
-def _collect(value: Any, found: dict[str, str]) -> None:
+def _renumbered(value: Any, ids: dict[str, str]) -> Any:
     """Bokeh numbers its models on from one chart to the next: each chart counts from 1 here."""
-    if isinstance(value, dict):
-        if isinstance(value.get("id"), str):
-            found.setdefault(value["id"], f"m{len(found) + 1}")
-        for item in value.values():
-            _collect(item, found)
-    elif isinstance(value, list):
-        for item in value:
-            _collect(item, found)
-
-
-def _renamed(value: Any, found: dict[str, str]) -> Any:
-    if isinstance(value, dict):
-        return {
-            key: found[item]
-            if key in ("id", "root_id") and isinstance(item, str)
-            else _renamed(item, found)
-            for key, item in value.items()
-        }
     if isinstance(value, list):
-        return [_renamed(item, found) for item in value]
-    return value
+        return [_renumbered(item, ids) for item in value]
+    if not isinstance(value, dict):
+        return value
+    return {
+        key: ids.setdefault(item, f"m{len(ids) + 1}")
+        if key in ("id", "root_id") and isinstance(item, str)
+        else _renumbered(item, ids)
+        for key, item in value.items()
+    }

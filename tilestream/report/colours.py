@@ -16,6 +16,8 @@ ACTUAL, AGAIN, HELD_OUT = "#0072b2", "#56b4e9", "#d55e00"
 CRITERION = {"FS": "#0072b2", "RQ": "#e69f00", "LY": "#009e73", "LS": "#cc79a7", "OB": "#56b4e9"}
 """The paper's four criteria, and observability."""
 OTHER = "#7f7f7f"
+CHOICES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", OTHER)
+"""Of the choices that are compared, in turn."""
 CLIP = 0.98
 """Quantile of the estimates at which the colours end: a few lost places must not hide the rest."""
 
@@ -24,6 +26,11 @@ def palette() -> list[str]:
     """Low to high: plasma without its ends, which vanish on a dark and on a light page."""
     ramp = mpl.colormaps["plasma"](np.linspace(0.1, 0.86, STEPS))
     return [mpl.colors.to_hex(colour) for colour in ramp]
+
+
+def to_rgb(colours: list[str]) -> Float64:
+    """(n, 3) red, green and blue of colours, 0 to 1."""
+    return np.asarray(mpl.colors.to_rgba_array(colours))[:, :3]
 
 
 @dataclass(frozen=True)
@@ -44,10 +51,7 @@ class Scale:
 
     def rgb(self, estimate: Float64) -> NDArray[np.uint8]:
         """(n, 3) colours of estimates, grey where there is none."""
-        colours = [*palette(), MISSING]
-        table = np.array([[int(c[k : k + 2], 16) for k in (1, 3, 5)] for c in colours], np.uint8)
-        chosen: NDArray[np.uint8] = table[self.step(estimate)]
-        return chosen
+        return (255.0 * to_rgb([*palette(), MISSING])[self.step(estimate)]).round().astype(np.uint8)
 
 
 def scale_of(estimate: Float64) -> Scale:

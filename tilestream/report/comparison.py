@@ -8,8 +8,8 @@ import pandas as pd
 
 from tilestream.errors import UsageError
 from tilestream.records import Float64
-from tilestream.report.judgement import check_threshold, worst_places
-from tilestream.report.summary import plain
+from tilestream.report.segments import check_threshold, worst_places
+from tilestream.report.summary import by_reason, plain, quantiles
 from tilestream.version import VERSION
 
 ROW_COLUMNS = (
@@ -84,30 +84,26 @@ class Comparison:
         any_knows = known.any(axis=1)
         size = self.cells.groupby("cell_size")["cells"].sum()
         found = []
-        for choice in _records(self.choices):
+        for choice in self.choices.to_dict("records"):
             part = self.rows[self.rows["choice"] == choice["choice"]]
             here = part["vd_mean"].dropna().to_numpy(np.float64)
             cells = int(size[choice["cell_size"]])
-            found.append(
-                {
-                    **choice,
-                    "places": len(part),
-                    "estimated": len(here),
-                    "median": float(np.median(here)) if here.size else None,
-                    "p95": float(np.quantile(here, QUANTILE)) if here.size else None,
-                    "max": float(here.max()) if here.size else None,
-                    "over_share": float((here > threshold).mean()) if here.size else None,
-                    "p_fail": float(part["vd_p_fail"].mean()) if here.size else None,
-                    "missing": _by_reason(part),
-                    "lost": int((any_knows & ~known[choice["choice"]]).sum()),
-                    "cells": cells,
-                    "map_bytes": cells * CELL_BYTES,
-                }
-            )
+            figures = {
+                "places": len(part),
+                "estimated": len(here),
+                **quantiles(here),
+                "over_share": float((here > threshold).mean()) if here.size else None,
+                "p_fail": float(part["vd_p_fail"].mean()) if here.size else None,
+                "missing": by_reason(part.loc[part["vd_mean"].isna(), "reason"]),
+                "lost": int((any_knows & ~known[choice["choice"]]).sum()),
+                "cells": cells,
+                "map_bytes": cells * CELL_BYTES,
+            }
+            found.append(dict(choice) | figures)
         return [dict(plain(figures)) for figures in found]
 
     def differing(self, count: int = 10) -> list[dict[str, Any]]:
-        """Where the choices differ most, no two places near one another (`judgement.APART`).
+        """Where the choices differ most, no two places near one another (`segments.APART`).
 
         Returns:
             The largest difference first: place, `best` and `worst` (of the choices that have an
@@ -135,7 +131,7 @@ class Comparison:
         A size suffices in a tile if it gives an estimate at every sample point there at which any
         size does, and the 95 % quantile of its estimates stays within the cap. The largest that
         suffices is chosen; where none does, the one that loses the fewest points and then has the
-        lowest quantile; where there is nothing to judge by, the smallest. Each estimate is that of
+        lowest quantile; where there is no estimate, the smallest. Each estimate is that of
         a map of one cell size throughout.
 
         Args:
@@ -204,14 +200,14 @@ def _size_of_tile(rows: pd.DataFrame | None, sizes: dict[float, str], cap: float
     if rows is None:
         return {"places": 0} | finest
     estimate = _by_choice(rows, "vd_mean")
-    judged = estimate[estimate.notna().any(axis=1)]
-    if judged.empty:
+    estimated = estimate[estimate.notna().any(axis=1)]
+    if estimated.empty:
         return {"places": len(estimate)} | finest
     ranked = []
     for cell_size, choice in sizes.items():
-        here: Float64 = judged[choice].dropna().to_numpy(np.float64)
+        here: Float64 = estimated[choice].dropna().to_numpy(np.float64)
         p95 = float(np.quantile(here, QUANTILE)) if here.size else np.inf
-        ranked.append((len(judged) - len(here), p95, cell_size))
+        ranked.append((len(estimated) - len(here), p95, cell_size))
     enough = [(lost, p95, cell) for lost, p95, cell in ranked if lost == 0 and p95 <= cap]
     _, p95, cell_size = max(enough, key=lambda r: r[2]) if enough else min(ranked)
     return {
@@ -226,14 +222,3 @@ def _by_choice(rows: pd.DataFrame, column: str) -> pd.DataFrame:
     """A row per sample point, a column per choice, also of choices without any figure."""
     keys = ["route_id", "sample", "choice"]
     return rows.set_index(keys)[column].unstack()  # noqa: PD010 - a pivot_table drops those
-
-
-def _by_reason(rows: pd.DataFrame) -> dict[str, int]:
-    """How many rows have no estimate, by reason, the commonest first."""
-    reasons = rows.loc[rows["vd_mean"].isna(), "reason"].astype(str).replace("", "no reason given")
-    counts = reasons.value_counts()
-    return {str(r): int(counts[r]) for r in sorted(counts.index, key=lambda r: (-counts[r], r))}
-
-
-def _records(table: pd.DataFrame) -> list[dict[str, Any]]:
-    return [{str(k): v for k, v in row.items()} for row in table.to_dict("records")]

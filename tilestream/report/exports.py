@@ -22,8 +22,8 @@ from tilestream.formats.pcd import write_pcd
 from tilestream.formats.rows import writing_whole
 from tilestream.records import Float64
 from tilestream.report.colours import scale_of
-from tilestream.report.findings import Findings, estimates
-from tilestream.report.judgement import segments
+from tilestream.report.data import Findings, estimates
+from tilestream.report.segments import segments
 from tilestream.report.summary import plain, segment
 
 GEOPARQUET = "1.1.0"
@@ -45,10 +45,15 @@ _CATALOGUE = {
 """What each column of the places means."""
 
 
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write a file that is whole or not there."""
+    with writing_whole(path) as file:
+        file.write(data)
+
+
 def write_text(path: Path, text: str) -> None:
     """Write text as UTF-8."""
-    with writing_whole(path) as file:
-        file.write(text.encode("utf-8"))
+    write_bytes(path, text.encode("utf-8"))
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
@@ -90,8 +95,7 @@ def write_geoparquet(path: Path, found: Findings) -> None:
     )
     buffer = io.BytesIO()
     pq.write_table(table.cast(schema), buffer, compression="zstd")
-    with writing_whole(path) as file:
-        file.write(buffer.getvalue())
+    write_bytes(path, buffer.getvalue())
 
 
 def _wkb(at: Float64, placed: np.ndarray[Any, np.dtype[np.bool_]]) -> list[bytes | None]:

@@ -1,113 +1,131 @@
-"""The page: one file that needs no network, the same bytes for the same findings."""
+"""The pages: templates filled with figures, each one file that needs no network.
 
-import json
+The same findings give the same bytes.
+"""
+
+import base64
 from collections.abc import Mapping, Sequence
-from importlib import resources
 from typing import Any
 
 from bokeh.resources import Resources
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
 
-from tilestream.report import evidence, places
-from tilestream.report.charts import city_map, path_chart
-from tilestream.report.findings import Findings
-from tilestream.report.words import esc
+from tilestream.report import charts, evaluation, formatting
+from tilestream.report.colours import ACTUAL, CLIP, CRITERION, HELD_OUT, OTHER
+from tilestream.report.comparison import QUANTILE, USUAL, Comparison
+from tilestream.report.data import AROUND, Findings
+from tilestream.report.pictures import ABOVE, BELOW, heights_ramp
+from tilestream.report.segments import APART, BRIDGE
+from tilestream.report.summary import AXES, STARTS, cards
 
-CONTENTS = (
-    ("headline", "In short"),
-    ("map", "Map"),
-    ("worst", "Worst places"),
-    ("paths", "Measured and estimated"),
-    ("importances", "What drives them"),
-    ("table-iv", "Table IV"),
-    ("calibration", "Intervals"),
-    ("protocols", "How good"),
-    ("facts", "Run facts"),
-)
+MOST_ROUTES = 40
+"""Routes that the page lists, the worst by their 95 % quantile; `report.json` has all."""
+MOST_SEGMENTS = 15
+"""Segments that the page lists; the file has all."""
+MOST_CHARTS = 24
+"""Labelled paths, or compared routes, that have a chart."""
+MOST_TILES = 60
+"""Tiles that the page lists of each vehicle; `compare.json` has all."""
 
 
-def page(found: Findings, content: Mapping[str, Any], pictures: Mapping[int, bytes | str]) -> str:
-    """The whole page as HTML.
+def _environment() -> Environment:
+    """Templates that escape every value, and refuse a name that is not there."""
+    environment = Environment(
+        loader=PackageLoader("tilestream.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
+    filters = (
+        formatting.cm, formatting.cm_by_name, formatting.percent, formatting.number,
+        formatting.distance, formatting.thousands, formatting.megabytes, formatting.fact,
+    )  # fmt: skip
+    environment.filters |= {function.__name__: function for function in filters}
+    environment.filters["base64"] = lambda data: base64.b64encode(data).decode("ascii")
+    environment.tests["known"] = formatting.known
+    environment.globals |= {"cm_span": formatting.cm_span, "evaluation": evaluation}
+    environment.globals |= {"CRITERION": CRITERION, "OTHER": OTHER}
+    environment.globals |= {"ACTUAL": ACTUAL, "HELD_OUT": HELD_OUT}
+    return environment
+
+
+_ENVIRONMENT = _environment()
+
+
+def report_page(
+    found: Findings, content: Mapping[str, Any], pictures: Mapping[int, bytes | str]
+) -> str:
+    """The page of a run as HTML.
 
     Args:
         found: what is reported.
         content: its `summary`.
         pictures: PNG of each of the worst places by number, or why there is none.
     """
-    parts = (
-        places.headline(content),
-        places.city_map(found, content),
-        places.worst(content, pictures),
-        places.paths(content),
-        evidence.importances(found),
-        evidence.table_iv(found),
-        evidence.calibration(found),
-        evidence.protocols(found),
-        places.facts(content),
-    )
-    charts = [city_map(found)]
-    for number, path in enumerate(content["paths"][: places.MOST_PATHS]):
-        charts.append(path_chart(found, path["path"]) | {"target_id": f"path-{number}"})
-    return document(
-        found.title,
-        "The localization error of a lidar vehicle, estimated from the point-cloud map alone.",
-        CONTENTS,
-        "".join(parts),
-        charts,
-        missing="The charts need JavaScript; they are also in the folder figures.",
-        footer=f"Made by tilestream {esc(content['tilestream'])}. The same figures for machines: "
-        "<code>report.json</code>, <code>places.parquet</code>, <code>places.csv</code>, "
-        "<code>over_threshold.geojson</code>, <code>map.pcd</code>, <code>figures/</code>.",
+    paths = content["paths"][:MOST_CHARTS]
+    segments = sorted(content["segments"], key=lambda s: (-s["worst"], s["route_id"], s["begin"]))
+    tip = _ENVIRONMENT.get_template("map_tip.html.j2").render()
+    return _render(
+        "report.html.j2",
+        content,
+        [charts.city_map(found, tip)]
+        + [charts.path_chart(found, path["path"], f"path-{k}") for k, path in enumerate(paths)],
+        cards=cards(content),
+        routes=_listed_routes(content["routes"]),
+        segments=segments[:MOST_SEGMENTS],
+        paths=paths,
+        pictures=pictures,
+        shown_every=charts.map_shows_every(found),
+        clip=CLIP,
+        bridge=BRIDGE,
+        apart=APART,
+        heights={"around": AROUND, "low": -BELOW, "high": ABOVE, "ramp": heights_ramp()},
+        parts=(AXES, STARTS),
     )
 
 
-def document(
-    title: str,
-    subtitle: str,
-    contents: Sequence[tuple[str, str]],
-    body: str,
-    charts: Sequence[Mapping[str, Any]],
-    *,
-    missing: str,
-    footer: str,
-) -> str:
-    """A page with charts as one HTML file that asks for nothing.
+def comparison_page(found: Comparison, content: Mapping[str, Any]) -> str:
+    """The page of a comparison as HTML.
 
     Args:
-        title: plain text.
-        subtitle: plain text.
-        contents: the sections, (name, title) each.
-        body: their HTML.
-        charts: items for the elements of the body that they name.
-        missing: plain text instead of the charts, where there is no JavaScript.
-        footer: HTML.
+        found: what is compared.
+        content: its `content`.
     """
-    links = "".join(f'<a href="#{name}">{text}</a>' for name, text in contents)
-    return (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        '<link rel="icon" href="data:,">\n'
-        f"<title>{esc(title)}</title>\n<style>\n{_own('page.css')}</style>\n</head>\n<body>\n"
-        f"<header><h1>{esc(title)}</h1><p>{esc(subtitle)}</p></header>\n"
-        f'<nav aria-label="Sections"><div>{links}</div></nav>\n'
-        f"<main>\n{body}</main>\n"
-        f"<noscript><p>{esc(missing)}</p></noscript>\n"
-        f"<footer>{footer}</footer>\n"
-        + "".join(_data(chart) for chart in charts)
-        + f"<script>\n{_bokeh()}\n</script>\n<script>\n{_own('page.js')}</script>\n"
-        "</body>\n</html>\n"
+    routes = content["routes"][:MOST_CHARTS]
+    return _render(
+        "comparison.html.j2",
+        content,
+        [charts.route_chart(found, name, f"route-{k}") for k, name in enumerate(routes)],
+        routes=routes,
+        vehicles=[(of, _listed_tiles(of["tiles"])) for of in content["cell_sizes"]],
+        shown_every=charts.line_shows_every(found),
+        apart=APART,
+        quantile=QUANTILE,
+        usual=USUAL,
     )
 
 
-def _data(chart: Mapping[str, Any]) -> str:
-    """A chart as JSON that no name in it can end: `<` stands as its escape."""
-    text = json.dumps(chart, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
-    return f'<script type="application/json" class="chart-data">{text}</script>\n'
+def _render(
+    template: str, content: Mapping[str, Any], items: Sequence[Mapping[str, Any]], **more: Any
+) -> str:
+    # BokehJS without widgets, tables and what needs a server
+    bokeh = Markup(Resources(mode="inline", components=["bokeh"]).js_raw[0])
+    limit = formatting.cm(content["threshold"], 0)
+    page = _ENVIRONMENT.get_template(template)
+    return page.render(content=content, charts=items, bokeh=bokeh, limit=limit, **more)
 
 
-def _bokeh() -> str:
-    """BokehJS without widgets, tables and what needs a server."""
-    return str(Resources(mode="inline", components=["bokeh"]).js_raw[0])
+def _listed_routes(routes: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    if len(routes) <= MOST_ROUTES:
+        return routes
+    return sorted(routes, key=lambda r: (-(r["p95"] or 0.0), r["route_id"]))[:MOST_ROUTES]
 
 
-def _own(name: str) -> str:
-    return (resources.files("tilestream.report") / name).read_text(encoding="utf-8")
+def _listed_tiles(tiles: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """First those where no size suffices, last those without a sample point."""
+    ranked = sorted(tiles, key=lambda t: (t["suffices"] is not False, not t["places"], t["tile"]))
+    return ranked[:MOST_TILES]

@@ -1,6 +1,7 @@
 """Pictures as PNG: the worst places from above, and the charts for papers and slides."""
 
 import io
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -21,11 +22,12 @@ from tilestream.report.colours import (
     OTHER,
     palette,
     scale_of,
+    to_rgb,
 )
-from tilestream.report.findings import AROUND, Findings, estimates
-from tilestream.report.judgement import worst_places
-from tilestream.report.summary import held_out_along, interval_factor, with_gaps
-from tilestream.report.words import CM_PER_M
+from tilestream.report.data import AROUND, Findings, estimates
+from tilestream.report.formatting import CM_PER_M
+from tilestream.report.lines import path_lines
+from tilestream.report.segments import worst_places
 
 PIXEL = 0.25
 """Edge of a pixel of the view from above [m]."""
@@ -120,8 +122,7 @@ def map_figure(found: Findings) -> Figure:
 
 def _colour_bar(axes: Axes, low: float, high: float) -> None:
     bar = axes.inset_axes((1.02, 0.1, 0.02, 0.8))
-    ramp = np.array([[int(c[k : k + 2], 16) / 255.0 for k in (1, 3, 5)] for c in palette()])
-    bar.imshow(ramp[:, None], origin="lower", aspect="auto",
+    bar.imshow(to_rgb(palette())[:, None], origin="lower", aspect="auto",
                extent=(0.0, 1.0, low * CM_PER_M, high * CM_PER_M))  # fmt: skip
     bar.set(xticks=[], ylabel="estimated error [cm]")
     bar.yaxis.set_label_position("right")
@@ -134,18 +135,14 @@ def paths_figure(found: Findings) -> Figure:
     figure = Figure(figsize=(10.0, 2.1 * len(names) + 0.6), layout="constrained")
     panels = figure.subplots(len(names), 1, squeeze=False)[:, 0]
     for axes, name in zip(panels, names, strict=True):
-        here = found.labels[found.labels["path"].astype(str) == name]
-        factor = interval_factor(found.coverage, name)
-        for number, (_, part) in enumerate(here.groupby("group", sort=True)):
-            arc, measured = _broken(part, "error_mean")
-            axes.plot(
-                arc, measured, "--" if number else "-", color=AGAIN if number else ACTUAL, lw=1.1
-            )
-        along = held_out_along(here, factor)
-        arc, held = _broken(along, "held_out")
-        axes.plot(arc, held, color=HELD_OUT, lw=1.4)
-        (_, low), (_, high) = _broken(along, "low"), _broken(along, "high")
-        axes.fill_between(arc, low, high, color=HELD_OUT, alpha=0.18, lw=0)
+        lines = path_lines(found, name)
+        for number, drive in enumerate(lines.measured.values()):
+            style: dict[str, Any] = {"ls": "--", "color": AGAIN} if number else {"color": ACTUAL}
+            axes.plot(drive["arc"], drive["measured"], lw=1.1, **style)
+        along = lines.estimate
+        axes.plot(along["arc"], along["estimate"], color=HELD_OUT, lw=1.4)
+        band: dict[str, Any] = {"color": HELD_OUT, "alpha": 0.18, "lw": 0}
+        axes.fill_between(along["arc"], along["low"], along["high"], **band)
         axes.set_title(f"path {name}", loc="left", fontsize=10, parse_math=False)
         axes.set(ylabel="error [cm]", ylim=(0.0, None))
         axes.grid(alpha=0.25)
@@ -162,14 +159,6 @@ def paths_figure(found: Findings) -> Figure:
         frameon=False,
     )
     return figure
-
-
-def _broken(along: pd.DataFrame, name: str) -> tuple[Float64, Float64]:
-    """Arc length [m] and a column [cm], with NaN where the line is to be broken."""
-    arc = along["arc_length"].to_numpy(np.float64)
-    breaks = with_gaps(arc)
-    values = along[name].to_numpy(np.float64) * CM_PER_M
-    return np.insert(arc, breaks, np.nan), np.insert(values, breaks, np.nan)
 
 
 def importances_figure(importances: pd.DataFrame) -> Figure:

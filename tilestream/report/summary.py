@@ -1,6 +1,7 @@
 """The figures of a report as plain values, for machines and for the page alike."""
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -9,16 +10,16 @@ import pandas as pd
 from tilestream.forest.evaluation import PAPER_TABLE, figures
 from tilestream.forest.training import PREDICTION_COLUMNS
 from tilestream.records import Float64, Int64
-from tilestream.report.findings import PLACE_COLUMNS, Findings, estimates, like_training
-from tilestream.report.judgement import reaches, segments, worst_places
+from tilestream.report.data import PLACE_COLUMNS, Findings, estimates, like_training
+from tilestream.report.formatting import cm, distance, known, percent, thousands
+from tilestream.report.lines import held_out_along, interval_factor
+from tilestream.report.segments import reaches, segments, worst_places
 from tilestream.version import VERSION
 
 THRESHOLDS = (0.05, 0.10, 0.15, 0.20, 0.25, 0.50)
 """Errors that people ask for [m]: the paper's Table I, and around them."""
 AXES, STARTS = ("along", "across", "up"), ("floor", "tail")
 """The parts of an estimate [m]: by direction; of the starts nearby, and what farther ones add."""
-GAP = 3.0
-"""Labels farther apart along a path than this many typical distances are not joined by a line."""
 
 
 def summary(found: Findings, threshold: float) -> dict[str, Any]:
@@ -56,38 +57,68 @@ def summary(found: Findings, threshold: float) -> dict[str, Any]:
 def headline(places: pd.DataFrame, threshold: float) -> dict[str, Any]:
     """How long, how good, and how much is not known."""
     estimate = estimates(places)
-    known = np.isfinite(estimate)
-    here = estimate[known]
+    there = np.isfinite(estimate)
+    here = estimate[there]
     reach = reaches(places)
-    over = known & (np.where(known, estimate, 0.0) > threshold)
+    over = there & (np.where(there, estimate, 0.0) > threshold)
     like = like_training(places)
-    outside, judged = int((like == "no").sum()), int((like != "not known").sum())
-    missing = places.loc[~known, "reason"].fillna("").astype(str).replace("", "no reason given")
-    counts = missing.value_counts()
+    outside, compared = int((like == "no").sum()), int((like != "not known").sum())
+    missing = places.loc[~there, "reason"]
     return {
         "places": len(places),
         "routes": int(places["route_id"].nunique()),
         "length": float(reach.sum()),
-        "estimated": int(known.sum()),
-        "median": float(np.median(here)) if here.size else None,
-        "p95": float(np.quantile(here, 0.95)) if here.size else None,
-        "max": float(here.max()) if here.size else None,
+        "estimated": int(there.sum()),
+        **quantiles(here),
         "over": int(over.sum()),
         "over_share": float(over.sum() / here.size) if here.size else None,
         "over_length": float(reach[over].sum()),
-        "outside": outside if judged else None,
-        "outside_share": outside / judged if judged else None,
+        "outside": outside if compared else None,
+        "outside_share": outside / compared if compared else None,
         "missing": len(missing),
         "missing_share": len(missing) / len(places),
-        "missing_by_reason": {
-            str(reason): int(counts[reason])
-            for reason in sorted(counts.index, key=lambda r: (-counts[r], r))
-        },
+        "missing_by_reason": by_reason(missing),
         "shares_over": {
             f"{limit:.2f}": float((here > limit).mean()) if here.size else None
             for limit in THRESHOLDS
         },
     }
+
+
+def quantiles(errors: Float64) -> dict[str, float | None]:
+    """`median`, `p95` and `max` of errors, all of them known; None of no error."""
+    if not errors.size:
+        return {"median": None, "p95": None, "max": None}
+    median, p95, most = np.quantile(errors, [0.5, 0.95, 1.0]).tolist()
+    return {"median": median, "p95": p95, "max": most}
+
+
+def by_reason(reasons: pd.Series) -> dict[str, int]:
+    """How often each reason for a missing estimate is given, the commonest first."""
+    counts = reasons.fillna("").astype(str).replace("", "no reason given").value_counts()
+    return {str(r): int(counts[r]) for r in sorted(counts.index, key=lambda r: (-counts[r], r))}
+
+
+def cards(content: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The figures that a map team asks for first, and what each of them is.
+
+    Args:
+        content: `summary`, or what `report.json` has of it.
+    """
+    head, limit = content["headline"], cm(content["threshold"], 0)
+    unlike = (percent(head["outside_share"]), "of the places unlike the training places")
+    over = f"of the places over {limit}: {distance(head['over_length'])} of road"
+    missing = f"places without an estimate ({percent(head['missing_share'])})"
+    return [
+        (distance(head["length"]), f"of road, {thousands(head['places'])} sample points"),
+        (cm(head["median"]), "median estimated error"),
+        (cm(head["p95"]), "95 % of the places are estimated below this"),
+        (cm(head["max"]), "the highest estimate"),
+        (percent(head["over_share"]), over),
+        *([unlike] if known(head["outside_share"]) else []),
+        (thousands(head["labelled"]), "measured errors to train on and to judge by"),
+        (thousands(head["missing"]), missing),
+    ]
 
 
 def routes(places: pd.DataFrame, threshold: float) -> list[dict[str, Any]]:
@@ -140,60 +171,26 @@ def paths(found: Findings) -> list[dict[str, Any]]:
     rows = []
     for name, part in found.labels.groupby("path", sort=True):
         actual, held = (part[c].to_numpy(np.float64) for c in ("error_mean", "held_out"))
-        judged = np.isfinite(actual) & np.isfinite(held)
+        evaluated = np.isfinite(actual) & np.isfinite(held)
         factor = interval_factor(found.coverage, str(name))
         row = {
             "path": str(name),
             "points": len(part),
             "groups": sorted(set(part["group"].astype(str))),
-            "judged": int(judged.sum()),
+            "judged": int(evaluated.sum()),
             "factor": factor,
             "interval": bool(held_out_along(part, factor)["low"].notna().any()),
             "actual_median": float(np.nanmedian(actual)),
-            "estimate_median": float(np.median(held[judged])) if judged.any() else None,
+            "estimate_median": float(np.median(held[evaluated])) if evaluated.any() else None,
             "mae": None,
             "spearman": None,
         }
-        if judged.any():
-            median = np.full(int(judged.sum()), np.median(actual[judged]))
-            of = figures(actual[judged], held[judged], median)
+        if evaluated.any():
+            median = np.full(int(evaluated.sum()), np.median(actual[evaluated]))
+            of = figures(actual[evaluated], held[evaluated], median)
             row |= {"mae": of.mae, "spearman": of.spearman}
         rows.append(row)
     return rows
-
-
-def interval_factor(coverage: pd.DataFrame, path: str) -> float | None:
-    """The factor of a path's interval, calibrated on the other paths; None where there is none."""
-    if coverage.empty:
-        return None
-    factor = coverage.loc[coverage["path"].astype(str) == path, "factor"].to_numpy(np.float64)
-    return float(factor[0]) if factor.size and np.isfinite(factor[0]) else None
-
-
-def held_out_along(labels: pd.DataFrame, factor: float | None) -> pd.DataFrame:
-    """The held-out estimate of each labelled place of a path: drives over a place share it.
-
-    Args:
-        labels: of one path.
-        factor: of its interval (`interval_factor`), where the labels have no `low` and `high`.
-
-    Returns:
-        A row per `arc_length` [m], rising, with `held_out`, `low`, `high` (NaN where there is no
-        interval) and `error_mean` (of all drives) [m].
-    """
-    if not {"low", "high"} <= set(labels):
-        held, wide = labels["held_out"], np.nan if factor is None else factor
-        labels = labels.assign(low=held / wide, high=held * wide)
-    names = ["held_out", "low", "high", "error_mean"]
-    return labels.groupby("arc_length", as_index=False)[names].mean()
-
-
-def with_gaps(arc: Float64) -> Int64:
-    """Indices before which a line along a path must be broken: the next label is far away."""
-    step = np.diff(arc)
-    if not step.size:
-        return np.zeros(0, np.int64)
-    return np.flatnonzero(step > GAP * np.median(step)) + 1
 
 
 def plain(value: Any) -> Any:

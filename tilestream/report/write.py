@@ -1,16 +1,17 @@
-"""Findings in, a folder out."""
+"""Findings or a comparison in, a folder out."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from tilestream.errors import TilestreamError
-from tilestream.formats.rows import writing_whole
 from tilestream.report import pictures
+from tilestream.report.comparison import Comparison
+from tilestream.report.data import Findings, estimates
 from tilestream.report.exports import (
+    write_bytes,
     write_cloud,
     write_csv,
     write_geojson,
@@ -18,11 +19,10 @@ from tilestream.report.exports import (
     write_json,
     write_text,
 )
-from tilestream.report.findings import Findings, estimates
-from tilestream.report.judgement import check_threshold
-from tilestream.report.page import page
+from tilestream.report.formatting import known
+from tilestream.report.page import comparison_page, report_page
+from tilestream.report.segments import check_threshold
 from tilestream.report.summary import plain, summary
-from tilestream.report.words import known
 
 THRESHOLD = 0.25
 """Estimates above this are too large [m]: the paper's, and where Autoware warns."""
@@ -57,21 +57,41 @@ def write_report(
     write_geojson(place / "over_threshold.geojson", findings, threshold)
     write_csv(place / "places.csv", findings.places)
     content["not_in_cloud"] = write_cloud(place / "map.pcd", findings.places)
-    worst = _worst(findings, content)
+    worst = {n: _picture(findings, at) for n, at in enumerate(content["worst"], start=1)}
     content["figures"] = _write_figures(place / "figures", findings, worst)
-    write_text(place / "index.html", page(findings, content, worst))
+    write_text(place / "index.html", report_page(findings, content, worst))
     write_json(place / "report.json", content)
     return dict(plain(content))
 
 
-def _worst(findings: Findings, content: Mapping[str, Any]) -> dict[int, bytes | str]:
-    """The surroundings of each of the worst places as PNG, or why there is no picture."""
-    return {
-        number: _picture(findings, worst) for number, worst in enumerate(content["worst"], start=1)
-    }
+def write_comparison(
+    found: Comparison, folder: str | Path, *, threshold: float, cap: float
+) -> dict[str, Any]:
+    """Write `compare.html` (needs no network), `compare.json` and `compare.csv`, each whole.
+
+    Args:
+        found: what is compared.
+        folder: where to; made where it does not exist.
+        threshold: estimates above this are too large [m].
+        cap: within which the 95 % quantile of a tile's estimates must stay [m].
+
+    Returns:
+        The content of `compare.json`.
+
+    Raises:
+        UsageError: a threshold or cap that is no positive length.
+    """
+    content = found.content(threshold, cap)
+    place = Path(folder)
+    place.mkdir(parents=True, exist_ok=True)
+    write_csv(place / "compare.csv", found.rows)
+    write_text(place / "compare.html", comparison_page(found, content))
+    write_json(place / "compare.json", content)
+    return content
 
 
 def _picture(findings: Findings, worst: Mapping[str, Any]) -> bytes | str:
+    """The surroundings of one of the worst places as PNG, or why there is no picture."""
     if findings.around is None:
         return "the report was made without the map"
     if not all(known(worst[name]) for name in ("x", "y", "z", "heading")):
@@ -88,22 +108,19 @@ def _picture(findings: Findings, worst: Mapping[str, Any]) -> bytes | str:
 
 def _write_figures(folder: Path, findings: Findings, worst: Mapping[int, bytes | str]) -> list[str]:
     """Write what there is to draw; the names of the files."""
-    drawn: dict[str, Callable[[], Figure]] = {
-        "map.png": lambda: pictures.map_figure(findings),
-    }
+    drawn = {"map.png": pictures.map_figure(findings)}
     if len(findings.labels) or np.isfinite(estimates(findings.places)).any():
-        drawn["distribution.png"] = lambda: pictures.distribution_figure(findings)
+        drawn["distribution.png"] = pictures.distribution_figure(findings)
     if len(findings.labels):
-        drawn["paths.png"] = lambda: pictures.paths_figure(findings)
+        drawn["paths.png"] = pictures.paths_figure(findings)
     if len(findings.importances):
-        drawn["importances.png"] = lambda: pictures.importances_figure(findings.importances)
+        drawn["importances.png"] = pictures.importances_figure(findings.importances)
     if len(findings.coverage):
-        drawn["coverage.png"] = lambda: pictures.coverage_figure(findings.coverage)
-    files = {name: pictures.png(draw()) for name, draw in drawn.items()}
+        drawn["coverage.png"] = pictures.coverage_figure(findings.coverage)
+    files = {name: pictures.png(figure) for name, figure in drawn.items()}
     files |= {f"worst_{n:02d}.png": data for n, data in worst.items() if isinstance(data, bytes)}
     for name, data in files.items():
-        with writing_whole(folder / name) as file:
-            file.write(data)
+        write_bytes(folder / name, data)
     for old in folder.glob("*.png"):
         if old.name not in files:
             old.unlink()

@@ -19,7 +19,7 @@ from tilestream.pipeline.jobs.run_settings import ModelSettings
 from tilestream.pipeline.stages.evaluate import by_protocol
 from tilestream.pipeline.stages.samples import places_with_factors
 from tilestream.records import Float64
-from tilestream.report.findings import AROUND, Findings
+from tilestream.report.data import AROUND, Findings
 from tilestream.store import TileStore
 from tilestream.tables import read_tables, remove_others
 from tilestream.tiling import MM_PER_M, Box

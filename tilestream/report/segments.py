@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from tilestream.errors import UsageError
 from tilestream.records import Float64, Int64
-from tilestream.report.findings import estimates
+from tilestream.report.data import estimates
 
 WORST = 10
 """How many of the worst places are shown."""

@@ -28,7 +28,7 @@ def _none() -> pd.DataFrame:
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """All that is told about a run. An empty table is told as empty, with what that means.
+    """All that a report shows of a run. Of an empty table it says that it is empty, and why.
 
     Raises:
         UsageError: no places, a column that a table lacks, a place that is there twice.
