@@ -129,7 +129,10 @@ def draw(store: ts.TileStore, found: dict[str, pd.DataFrame], path: Path) -> Non
     low = labels[["x", "y"]].min().to_numpy() - 28.0
     high = labels[["x", "y"]].max().to_numpy() + 28.0
     seen = ((points[:, :2] > low) & (points[:, :2] < high)).all(axis=1) & (points[:, 2] > -1.2)
-    figure, panels = plt.subplots(1, len(found), figsize=(11.0, 5.2), layout="constrained")
+    figure, grid = plt.subplots(
+        1, len(found), figsize=(11.0, 5.2), layout="constrained", squeeze=False
+    )
+    panels = grid[0]
     for axes, (title, table) in zip(panels, found.items(), strict=True):
         draw_panel(axes, points[seen][::2], table, title)
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="map x [m]")

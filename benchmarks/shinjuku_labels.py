@@ -164,10 +164,11 @@ def against(before: pd.Series, after: pd.Series) -> str:
 
 def labels_in(folder: Path, every: int, drive: int) -> pd.Series:
     """Mean errors [m] that a run left in its folder, by path and number of the scan."""
-    tables = (folder / f"labels-{every}" / f"drive{drive}").glob("*/errors/*.parquet")
-    table = pd.concat({file.stem: pd.read_parquet(file) for file in tables})
-    done = table[table["status"] == "done"].droplevel(1).set_index("scan", append=True)
-    return done["error_mean"].sort_index()
+    runs = sorted((folder / f"labels-{every}" / f"drive{drive}").iterdir())
+    tables = {run.name: pd.read_parquet(run / "errors") for run in runs}
+    table = pd.concat(tables, names=["path"])
+    done = table[table["status"] == "done"].set_index("scan", append=True)
+    return done["error_mean"].droplevel(1)
 
 
 def changed(settings: SimulationSettings, changes: dict[str, dict[str, Any]]) -> SimulationSettings:

@@ -159,7 +159,7 @@ def test_geoparquet_of_a_local_frame_says_that_its_crs_is_unknown(tmp_path: Path
 
 
 def test_csv_is_read_back_to_the_bit(found: Findings, folder: Path) -> None:
-    read = pd.read_csv(folder / "places.csv", keep_default_na=True)
+    read = pd.read_csv(folder / "places.csv", float_precision="round_trip")
     pd.testing.assert_frame_equal(read, found.places, check_dtype=False, check_exact=True)
 
 

@@ -30,7 +30,7 @@ def wandering(count: int, seed: int = 0) -> Trajectory:
     rng = np.random.default_rng(seed)
     stamps = START + np.sort(rng.choice(count * 10**8, count, replace=False))
     T = np.tile(np.eye(4), (count, 1, 1))
-    T[:, :3, :3] = Rotation.random(count, rng=rng).as_matrix()
+    T[:, :3, :3] = Rotation.random(count, rng).as_matrix()
     T[:, :3, 3] = rng.uniform(-10, 10, (count, 3)) + np.array([3.7e5, 3.95e6, 40])
     return Trajectory(stamps, T, "lidar")
 
