@@ -6,6 +6,8 @@ import uuid
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -19,8 +21,9 @@ from tilestream.errors import (
     UsageError,
 )
 from tilestream.formats.pcd import write_pcd
-from tilestream.marks import Mark, hash_of, identity_of
+from tilestream.marks import MISSING, Mark, hash_of, identity_of
 from tilestream.store import POINTS, Tile, cells_table
+from tilestream.tables import read_mark
 from tilestream.tiling import TileKey
 
 
@@ -227,3 +230,18 @@ def test_a_store_over_the_s3_protocol_holds_the_same_tiles(
             far.tile(key).points(halo=True), near.tile(key).points(halo=True)
         )
     assert ts.open_store(f"{s3_bucket}/map.zarr").sources() == near.sources()
+
+
+def test_what_version_0_1_wrote_is_refused_with_what_to_do(
+    tmp_path: Path, cloud: np.ndarray
+) -> None:
+    made = make_store(tmp_path, cloud[:10], tile_size=100.0)
+    path = Path(made.url) / "zarr.json"
+    path.write_text(path.read_text().replace('"schema": 2', '"schema": 1'))
+    with pytest.raises(
+        StoreVersionError, match=r"schema 1.*another path.*ingest"
+    ):
+        ts.open_store(made.url)
+    table = pa.table({"a": [1]}).replace_schema_metadata({"tilestream": '{"identity": "x"}'})
+    pq.write_table(table, tmp_path / "old.parquet")
+    assert read_mark(str(tmp_path / "old.parquet")) == MISSING

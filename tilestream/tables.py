@@ -55,14 +55,15 @@ def write_table(path: str, frame: pd.DataFrame, columns: Sequence[Column], mark:
 
 
 def read_mark(path: str) -> Mark:
-    """The mark of a table; `missing` where there is no whole table of ours at `path`."""
+    """The mark of a table; `missing` where no whole table is at `path`, or one of version 0.1."""
     fs, place = fsspec.core.url_to_fs(path)
     try:
         with fs.open(place, "rb") as file:
             metadata = pq.read_schema(file).metadata or {}
     except (FileNotFoundError, pa.ArrowInvalid):
         return MISSING
-    return Mark(**json.loads(metadata[_MARK])) if _MARK in metadata else MISSING
+    known = json.loads(metadata.get(_MARK, b"{}"))
+    return Mark(**known) if "status" in known else MISSING
 
 
 def remove_others(keep: Sequence[str]) -> None:
