@@ -30,6 +30,7 @@ LONG = (
     "scale",
     "dashboard",
     "report",
+    "view",
     "observe_route",
     "forest_models",
     "interpreted",

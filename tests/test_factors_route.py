@@ -62,7 +62,9 @@ def test_rows_follow_the_route_and_say_what_the_factors_of_their_places_are(
     np.testing.assert_array_equal(table["heading"], points.heading)
     assert (table["status"] == "done").all()
     direct = ts.factors(store, points.positions, sensor=SENSOR, which="all")
-    pd.testing.assert_frame_equal(table[direct.columns.tolist()], direct, check_dtype=False)
+    pd.testing.assert_frame_equal(
+        table[direct.columns.tolist()], direct, check_dtype=False, check_exact=True
+    )
 
 
 def test_the_tables_name_their_map(store: ts.TileStore, table: pd.DataFrame, street: Path) -> None:
@@ -133,7 +135,7 @@ def test_no_tiling_and_no_number_of_workers_shows(
     found = ts.factors_along(
         other, [route], tmp_path / "out", spacing=3.0, sensor=SENSOR, client=workers
     )
-    pd.testing.assert_frame_equal(found, table)
+    pd.testing.assert_frame_equal(found, table, check_exact=True)
 
 
 def rows_made(outcomes: list[Outcome]) -> int:
@@ -174,7 +176,7 @@ def test_a_route_elsewhere_redoes_nothing_here(
     away = route_of("away", np.array([[100.0, 50.0, 0.0], [112.0, 50.0, 0.0]]))
     both = ts.factors_along(store, [away, route], tmp_path, **how)
     assert {rows[key] for key in here} == {False}
-    pd.testing.assert_frame_equal(both[3:].reset_index(drop=True), alone)
+    pd.testing.assert_frame_equal(both[3:].reset_index(drop=True), alone, check_exact=True)
 
 
 def test_every_column_is_documented_in_the_file(table: pd.DataFrame, street: Path) -> None:

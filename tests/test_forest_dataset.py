@@ -36,7 +36,7 @@ def test_rows_are_joined_by_place_and_not_by_order(
     near = labels.assign(x=labels["x"] + rng.uniform(-0.3, 0.3, len(labels)))
     plain = join(factors, {"drive": near}, COLUMNS)
     mixed = join(factors.sample(frac=1.0, random_state=1), {"drive": near[::-1]}, COLUMNS)
-    pd.testing.assert_frame_equal(plain.rows, mixed.rows)
+    pd.testing.assert_frame_equal(plain.rows, mixed.rows, check_exact=True)
     assert len(plain) == sum(SHORT.values())
     want = dict(
         zip(zip(labels["y"], labels["arc_length"], strict=True), labels["error_mean"], strict=True)

@@ -63,7 +63,9 @@ def test_rows_follow_the_route_and_say_what_is_observed_from_their_places(
     np.testing.assert_array_equal(table["heading"], points.heading)
     assert (table["status"] == "done").all(), table["reason"].tolist()
     direct = observability(store, points.positions, points.heading, SENSOR, SEEING)
-    pd.testing.assert_frame_equal(table[direct.columns.tolist()], direct, check_dtype=False)
+    pd.testing.assert_frame_equal(
+        table[direct.columns.tolist()], direct, check_dtype=False, check_exact=True
+    )
 
 
 def test_no_tiling_and_no_number_of_workers_shows(

@@ -81,7 +81,9 @@ def test_a_job_over_the_s3_protocol_gives_the_same_store_and_tables(
     assert {path.split("/")[0] for path in tables} == {"factors", "errors", "starts"}
     for path in tables:
         pd.testing.assert_frame_equal(
-            pd.read_parquet(f"{s3_bucket}/run/{path}"), pd.read_parquet(tmp_path / path)
+            pd.read_parquet(f"{s3_bucket}/run/{path}"),
+            pd.read_parquet(tmp_path / path),
+            check_exact=True,
         )
 
 

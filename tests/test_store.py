@@ -238,9 +238,7 @@ def test_what_version_0_1_wrote_is_refused_with_what_to_do(
     made = make_store(tmp_path, cloud[:10], tile_size=100.0)
     path = Path(made.url) / "zarr.json"
     path.write_text(path.read_text().replace('"schema": 2', '"schema": 1'))
-    with pytest.raises(
-        StoreVersionError, match=r"schema 1.*another path.*ingest"
-    ):
+    with pytest.raises(StoreVersionError, match=r"schema 1.*another path.*ingest"):
         ts.open_store(made.url)
     table = pa.table({"a": [1]}).replace_schema_metadata({"tilestream": '{"identity": "x"}'})
     pq.write_table(table, tmp_path / "old.parquet")

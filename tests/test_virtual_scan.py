@@ -23,6 +23,7 @@ from tilestream.factors.virtual_scan import (
     VirtualScan,
     VirtualSettings,
     draws,
+    first_returns,
     near_share,
     probability,
     virtual_scan,
@@ -241,10 +242,7 @@ def test_whole_voxels_of_translation_do_not_show(street: Floats) -> None:
         beams = Beams.of(FEW, CLEAN)
         place_mm = np.rint((place + shift) * 1000).astype(np.int64)
         scene = Scene.of(surfels_from(street + shift), place_mm[None], EDGE)
-        ranges, cosine = np.empty(len(here.ranges)), np.empty(len(here.ranges))
-        c, s = np.cos(0.3), np.sin(0.3)
-        turned = beams.direction @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T
-        cast(scene.bricks, place_mm, turned, 900.0, 40_000.0, ranges, cosine)
+        ranges, cosine, _ = first_returns(scene, place_mm, 0.3, CLEAN, beams)
         np.testing.assert_array_equal(ranges, here.ranges)
         np.testing.assert_array_equal(cosine, here.cosine)
 

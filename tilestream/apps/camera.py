@@ -6,13 +6,14 @@ import numpy as np
 
 from tilestream.records import Float64
 
-ELEVATION = np.radians(40.0)
+ELEVATION = np.radians(52.0)
 """How far the camera looks down: streets are seen between their walls, and walls as walls."""
-TURN = np.radians(30.0)
+TURN = np.radians(55.0)
 """How far it stands beside the line across the long side of what it sees."""
 
-MARGIN = 20.0
-"""The eye stands farther back than what it sees demands, to see what is around it [m]."""
+MARGIN, ROOM = 20.0, 1.1
+"""The eye stands farther back than what it sees demands, by this [m] and by this factor, to see
+what is around it."""
 ROUNDS = 20
 """Of moving the camera aside, until what it sees is in the middle, and back, until it fits."""
 
@@ -49,7 +50,7 @@ def oblique(points: Float64, aspect: float, field_of_view: float) -> Camera:
     half = np.tan(field_of_view / 2.0) * np.array([aspect, 1.0])
     aside, depth = offset.mean(axis=0), nearer.mean()
     for _ in range(ROUNDS):
-        back = float((np.abs(offset - aside) / half + nearer[:, None]).max()) + MARGIN
+        back = float((ROOM * np.abs(offset - aside) / half + nearer[:, None]).max()) + MARGIN
         picture = (offset - aside) / (back - nearer)[:, None]
         aside += (back - depth) * (picture.max(axis=0) + picture.min(axis=0)) / 2.0
     return Camera(np.append(aside, depth) @ axes, towards, axes[1], back - depth)

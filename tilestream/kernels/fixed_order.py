@@ -12,8 +12,7 @@ Float64 = NDArray[np.float64]
 
 def turned(R: Float64, points: Float64) -> Float64:
     """(n, 3) R p of every row p of `points`; R is (3, 3), or (n, 3, 3), one for each row."""
-    x, y, z = points.T
-    return np.stack([R[..., i, 0] * x + R[..., i, 1] * y + R[..., i, 2] * z for i in range(3)], -1)
+    return R[..., 0] * points[:, :1] + R[..., 1] * points[:, 1:2] + R[..., 2] * points[:, 2:]
 
 
 def row_sums(values: Float64) -> Float64:
