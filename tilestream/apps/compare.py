@@ -19,6 +19,7 @@ from tilestream.factors.rows import in_route_order, samples_by_tile
 from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, paths_of
+from tilestream.pipeline.engine.stage import Task
 from tilestream.pipeline.jobs.along_routes import SENSOR_HEIGHT, plan_observe
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.observe import Observing, observe
@@ -187,7 +188,8 @@ def plan_compare(
     require_names(choices)
     sizes_mm = sorted({whole_mm(choice.cell_size, "cell_size") for choice in choices})
     require_sizes(store, sizes_mm)
-    map_plan, tasks = MapPlan.of_store(store), []
+    map_plan = MapPlan.of_store(store)
+    tasks: list[Task] = []
     samples = samples_by_tile(store.grid, routes, spacing)
     for choice in choices:
         observing = Observing(

@@ -18,6 +18,7 @@ from tilestream.pipeline.jobs import run as main_job
 from tilestream.pipeline.jobs import simulate as simulation
 from tilestream.pipeline.jobs.forecast import forecast
 from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
+from tilestream.pipeline.stages.simulated import SCENE_BYTES
 from tilestream.report import cards, gate
 from tilestream.report.segments import MISSING, check_threshold
 from tilestream.simulation.settings import load_preset
@@ -149,7 +150,7 @@ def simulate(
     if dry_run:
         out.print(plan_table(simulation.plan_simulation(settings, folder, **what)))
         return
-    with cluster.client(simulation.SCENE_BYTES) as client, progress() as watch:
+    with cluster.client(SCENE_BYTES) as client, progress() as watch:
         made = simulation.simulate(settings, folder, **what, client=client, watch=watch)
     say(f"{city}, preset {settings.preset}: {settings.note}")
     say(f"The map is in {made}/survey, the drives are in {made}/logs")

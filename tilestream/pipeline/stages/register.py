@@ -110,13 +110,13 @@ def register(
         except (RegistrationError, PoseError, UsageError) as error:
             facts[str(sample.number)] = place | {"reason": str(error)}
         else:
-            known = {"sample": sample.number, "scan": sample.scan, "stamp_ns": scan.stamp_ns}
-            rows.append(found.assign(**known))
+            which = {"sample": sample.number, "scan": sample.scan, "stamp_ns": scan.stamp_ns}
+            rows.append(found.assign(**which))
             facts[str(sample.number)] = _place(T_map_true) | {"points": points, "reason": ""}
     names = {column.name: column.dtype for column in START_COLUMNS}
     frame = pd.concat(rows, ignore_index=True)[list(names)].astype(names)
     known = {"data_set": canonical(measuring), "store": map_part.store.address}
-    return Made(frame, {"samples": facts, **known})
+    return Made(frame, {**known, "samples": facts})
 
 
 def _registered(
