@@ -14,7 +14,7 @@ from tilestream.factors import table as table_module
 from tilestream.factors.catalogue import COLUMNS, COUNTS, columns_of, markdown
 from tilestream.factors.feature_sufficiency import dimensions, shape_shares
 from tilestream.factors.table import TermsCache, factors
-from tilestream.factors.terms import reach_mm, terms_mark, terms_table, tile_terms
+from tilestream.factors.terms import reach_mm, terms_table, tile_terms
 from tilestream.formats.pcd import write_pcd
 from tilestream.marks import Mark
 from tilestream.store import POINTS, Tile, TileStore
@@ -190,17 +190,17 @@ def test_a_failed_tile_fails_those_who_see_it_and_no_others(tmp_path: Path) -> N
 def test_terms_from_the_store_are_those_made_now(canyon: TileStore, tmp_path: Path) -> None:
     store = store_of(tmp_path, scene("canyon", 31))
     fresh = factors(store, ROUTE, which="all")
+    table = terms_table(2000)
     for key in store.keys():
         arrays = tile_terms(store, key).arrays()
-        now = terms_mark(store, key, 2000)
-        store.tile(key).write_table(terms_table(2000), arrays, now)
+        now = Mark("done", identity=table.identity(store.grid, key, store.identities()))
+        store.tile(key).write_table(table.name, arrays, now)
     assert factors(store, ROUTE, which="all").equals(fresh)
     odd = {**arrays, "mean": arrays["mean"] + 1.0}
-    store.tile(key).write_table(terms_table(2000), odd, now)
+    store.tile(key).write_table(table.name, odd, now)
     assert not factors(store, ROUTE, which="all").equals(fresh)
-    for other in ({"inputs": "another map"}, {"settings": "others"}, {"code": "0.0.1"}):
-        store.tile(key).write_table(terms_table(2000), odd, replace(now, **other))
-        assert factors(store, ROUTE, which="all").equals(fresh), "out of date: made anew"
+    store.tile(key).write_table(table.name, odd, replace(now, identity="of another map"))
+    assert factors(store, ROUTE, which="all").equals(fresh), "out of date: made anew"
 
 
 def test_a_small_cache_forgets_and_answers_the_same(canyon: TileStore) -> None:

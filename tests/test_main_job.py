@@ -367,7 +367,8 @@ def test_too_few_places_are_no_model(inputs: Path, tmp_path: Path) -> None:
         ts.run(job(inputs, tmp_path / "run", drives=drives))
     told = json.loads((tmp_path / "run" / "run.json").read_text())
     assert "train-model" in told["failures"]
-    page = html.unescape((tmp_path / "run" / "report" / "index.html").read_text())
+    text = html.unescape((tmp_path / "run" / "report" / "index.html").read_text())
+    page = " ".join(text.split())
     assert "no estimate" in page
     # What was measured is shown all the same.
     assert "26 labels of one drive" in page
@@ -482,7 +483,7 @@ def test_observability_joins_the_factors(inputs: Path, copy: Path) -> None:
     told = Told()
     ts.run(job(inputs, copy, observe={"range_max": 14.0}), watch=told)
     assert {"surfels", "observe"} <= {outcome.stage for outcome in told.outcomes}
-    assert told.worked() == {"join", "judge", "weigh", "train", "predict"}
+    assert told.worked() == set(LEARNT)
     dataset = ts.dataset(copy)
     assert len(dataset) == len(STREETS) * SCANS
     assert {"vd_mean", "ob_info_along", "feature_count"} <= set(dataset.names)

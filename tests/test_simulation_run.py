@@ -22,8 +22,8 @@ from tilestream.config import StartSettings
 from tilestream.errors import PlanError, UsageError
 from tilestream.formats.mcap import ScanSelection, open_log
 from tilestream.pipeline.engine.stage import BASE_BYTES
-from tilestream.pipeline.jobs import simulate as simulating
 from tilestream.pipeline.jobs.simulate import plan_simulation, simulate
+from tilestream.pipeline.stages import simulated
 from tilestream.records import Scan
 from tilestream.simulation.city import City, build_city
 from tilestream.simulation.drive import motion_of, scans, traffic_of
@@ -279,7 +279,7 @@ def test_the_plan_is_made_without_building_or_writing_anything(
     def never(*_: object) -> None:
         raise AssertionError("a plan builds no city")
 
-    monkeypatch.setattr(simulating, "build_city", never)
+    monkeypatch.setattr(simulated, "build_city", never)
     plan = plan_simulation(settings, tmp_path / "out")
     stages = {stage: (count, bytes_) for stage, count, bytes_ in plan.describe()}
     assert {stage: count for stage, (count, _) in stages.items()} == {

@@ -7,13 +7,14 @@ import pytest
 
 import tilestream as ts
 from tilestream.factors.ghosts import ghosts_among
-from tilestream.factors.observability import box_around, whole_places
+from tilestream.factors.observability import whole_places
 from tilestream.factors.surfels import surfel_mm, surfels_in
 from tilestream.factors.virtual_scan import Scene
 from tilestream.formats.mcap import open_log
 from tilestream.kernels.virtual_scan import cast
 from tilestream.pipeline.jobs.simulate import simulate
 from tilestream.simulation.settings import load_preset
+from tilestream.tiling import Box
 
 NEAR, REACH = 1_000.0, 76_000.0
 """Of the beams that are cast [mm]."""
@@ -33,7 +34,7 @@ def test_most_beams_end_where_those_of_the_simulator_did(tmp_path: Path) -> None
     ):
         assert scan.T_map_lidar is not None
         place = scan.T_map_lidar[:3, 3]
-        surfels = surfels_in(store, box_around(place[None], REACH / 1e3))
+        surfels = surfels_in(store, Box.around(place[None], REACH / 1e3))
         seen = surfels.where(~ghosts_among(surfels, surfel_mm(store)))
         scene = Scene.of(seen, whole_places(place)[None], surfel_mm(store))
         true = np.linalg.norm(scan.points, axis=1)
