@@ -122,7 +122,7 @@ def test_without_a_terminal_progress_is_a_line_now_and_then(
     monkeypatch.setattr("tilestream.cli.progress.time.monotonic", lambda: next(clock))
     with progress() as watch:
         for stage, ended in (("merge", 1), ("cells", 1), ("cells", 2), ("cells", 3)):
-            watch(Outcome(f"{stage}-{ended}", stage, 0, ""), ended, 3)
+            watch(Outcome(f"{stage}-{ended}", stage), ended, 3)
     assert capsys.readouterr().err == "merge 1/3, cells 1/3\ncells 3/3\n"
 
 
@@ -133,7 +133,7 @@ def test_on_a_terminal_progress_shows_at_once_that_it_lives(
     monkeypatch.setattr("tilestream.cli.progress.err", screen)
     with progress() as watch:
         began = screen.file.getvalue()
-        watch(Outcome("merge-1", "merge", None, "no space left"), 1, 2)
+        watch(Outcome("merge-1", "merge", reason="no space left"), 1, 2)
     assert "starting" in began
     shown = screen.file.getvalue()
     assert "merge-1: no space left" in shown

@@ -868,7 +868,7 @@ def test_the_plan_tells_stages_memory_and_cost(
     stages = {row["stage"]: row for row in json.loads(capsys.readouterr().out)["stages"]}
     assert stages["factors"]["work"] == len(STREETS) * SCANS
     assert stages["label"]["after"] == ["register"]
-    assert stages["predict"]["after"] == ["factors", "observe", "train"]
+    assert stages["predict"]["after"] == ["factors", "train"]
     assert all(row["promised_bytes"] > 0 and row["core_hours"] >= 0 for row in stages.values())
     assert command(["run", str(config), "--dry-run"]) == 0
     assert "core-hours" in capsys.readouterr().out

@@ -15,6 +15,7 @@ from tilestream.errors import StoreNotFoundError, UsageError
 from tilestream.factors.rows import PLACE_COLUMNS
 from tilestream.forest.training import PREDICTION_COLUMNS
 from tilestream.formats.pcd import write_pcd
+from tilestream.marks import Mark
 from tilestream.tables import write_table
 
 
@@ -32,7 +33,9 @@ def estimated(run_dir: Path, x: list[float], estimate: list[float]) -> None:
     rows |= {"heading": [0.0] * len(x), "x": x, "y": [0.0] * len(x), "z": [2.0] * len(x)}
     frame = pd.DataFrame(rows).assign(estimate=estimate)
     columns = (*PLACE_COLUMNS, *PREDICTION_COLUMNS)
-    write_table(str(run_dir / "tables" / "predictions" / "0_0.parquet"), frame, columns, {})
+    write_table(
+        str(run_dir / "tables" / "predictions" / "0_0.parquet"), frame, columns, Mark("done")
+    )
 
 
 @pytest.fixture(scope="module")

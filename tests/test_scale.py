@@ -90,8 +90,9 @@ def test_a_job_over_the_s3_protocol_gives_the_same_store_and_tables(
 MEMORY = """
 import sys, time
 sys.path.insert(0, {tests!r})
-from naps import Nap
+from naps import MEMORY, Nap
 from tilestream.pipeline.engine.executor import execute
+from tilestream.pipeline.engine.plan import Plan
 from tilestream.tiling import TileKey
 
 def resident():
@@ -108,7 +109,7 @@ tasks = [
 ]
 planned = resident()
 began = time.process_time()
-outcomes = execute(tasks, None, None)
+outcomes = execute(Plan(tuple(tasks), MEMORY), None, None)
 assert len(outcomes) == COUNT and all(outcome.ok for outcome in outcomes)
 print((planned - before) / 1e6, (resident() - planned) / 1e6, time.process_time() - began)
 """

@@ -27,11 +27,12 @@ from tilestream.errors import StoreNotFoundError, TileNotReadyError, UsageError
 from tilestream.factors.rows import PLACE_COLUMNS
 from tilestream.forest.training import PREDICTION_COLUMNS
 from tilestream.formats.pcd import write_pcd
+from tilestream.marks import Mark
 from tilestream.pipeline.jobs.run_folder import map_of
 from tilestream.pipeline.stages.label import ERROR_COLUMNS
 from tilestream.records import Column
 from tilestream.report.colours import scale_of
-from tilestream.store import POINTS, Mark, Tile
+from tilestream.store import POINTS, Tile
 from tilestream.tables import write_table
 
 OFFSET = (370_000.0, 3_950_000.0, 30.0)
@@ -50,7 +51,7 @@ def write_places(
     path: Path, columns: tuple[Column, ...], x: list[float], store: ts.TileStore, **error: object
 ) -> None:
     rows = pd.DataFrame({"x": x}).add(OFFSET[0]).assign(y=OFFSET[1], z=OFFSET[2] + 2.0, **error)
-    write_table(str(path), rows, columns, {"store": store.address})
+    write_table(str(path), rows, columns, Mark("done", facts={"store": store.address}))
 
 
 @pytest.fixture(scope="module")
@@ -151,7 +152,7 @@ def test_the_map_of_a_run_is_found_inside_it_or_by_its_tables(
     assert map_of(run_dir).address == map_of(store.url).address == store.address
     moved = tmp_path / "run"
     shutil.copytree(run_dir, moved)
-    mark = {"store": str(tmp_path / "gone.zarr")}
+    mark = Mark("done", facts={"store": str(tmp_path / "gone.zarr")})
     frame = pd.DataFrame({"x": [0.0], "y": [0.0], "z": [0.0]})
     write_table(str(moved / "tables" / "factors" / "0.parquet"), frame, PLACE_COLUMNS, mark)
     with pytest.raises(StoreNotFoundError, match=r"gone\.zarr.*link"):

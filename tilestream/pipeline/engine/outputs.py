@@ -1,7 +1,9 @@
 """Where results go: written whole, marked last, known again by their identity."""
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import pandas as pd
@@ -28,6 +30,13 @@ class Stored(NamedTuple):
 
     rows: pd.DataFrame
     facts: dict[str, Any]
+
+
+def way_to(url: str, table: str) -> str:
+    """A store as a table names it: from the table's folder, if both are local paths."""
+    if "://" in url or "://" in table:
+        return url
+    return os.path.relpath(url, Path(table).parent)
 
 
 class Output(Protocol):
@@ -89,6 +98,8 @@ class Parquet:
     def write(self, made: Made, identity: str, columns: Sequence[Column]) -> Facts:
         """As `Output`; the value is a data frame."""
         facts = {"rows": len(made.value), **made.facts}
+        if "store" in facts:  # the same bytes wherever a job lies, and a way that moves with it
+            facts["store"] = way_to(facts["store"], self.path)
         write_table(self.path, made.value, columns, Mark("done", identity=identity, facts=facts))
         return {"rows": len(made.value)}
 

@@ -26,7 +26,9 @@ def map_of(place: str | os.PathLike[str]) -> TileStore:
     made_from_it = [*table_paths(place, "starts"), *table_paths(place, "factors")]
     if not made_from_it:
         return open_store(os.fspath(place))
-    named = read_mark(made_from_it[0]).facts.get("store", str(inside))
+    named = read_mark(made_from_it[0]).facts.get("store", str(inside.absolute()))
+    if "://" not in named:
+        named = os.path.normpath(Path(made_from_it[0]).parent.absolute() / named)
     try:
         return open_store(named)
     except StoreNotFoundError as error:
