@@ -1,12 +1,30 @@
 """Rays cast by Embree's own binding and by Open3D: do they meet the same, and what do they cost?
 
-python benchmarks/raycast.py [--preset paper] [--path I] [--point 100] [--stretch 50] [--rounds 7]
+python benchmarks/raycast.py [--preset paper] [--path I] [--point 100] [--metres 50] [--rounds 7]
 
 Both cast the same turns of the lidar at the same stretch of street, one after the other in every
 round. Times are CPU times of the process with all its threads, medians over the rounds.
 """
 
 import argparse
+
+
+def options() -> argparse.Namespace:
+    """What the command line asks for."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--preset", default="paper")
+    parser.add_argument("--path", default="I")
+    parser.add_argument("--point", type=int, default=100, help="where the stretch begins [m]")
+    parser.add_argument("--metres", type=int, default=50, help="length of the stretch")
+    parser.add_argument("--rounds", type=int, default=7)
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    GIVEN = options()  # before what is slow to import
+
 import time
 
 import numpy as np
@@ -19,21 +37,12 @@ from tilestream.simulation.settings import load_preset
 CASTERS: dict[str, type[Embree | Open3D]] = {"embreex": Embree, "Open3D": Open3D}
 
 
-def main() -> None:
+def main(given: argparse.Namespace) -> None:
     """Build, cast, compare, print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--preset", default="paper")
-    parser.add_argument("--path", default="I")
-    parser.add_argument("--point", type=int, default=100)
-    parser.add_argument("--stretch", type=int, default=50)
-    parser.add_argument("--rounds", type=int, default=7)
-    given = parser.parse_args()
     settings = load_preset(given.preset)
     city = build_city(settings, check=False)
     street = city.street(given.path)
-    xy = street.xy[given.point : given.point + given.stretch]
+    xy = street.xy[given.point : given.point + given.metres]
     origin = np.array([*xy[0], 0.0])
     corners = (city.scene(xy, 1).corners - origin).astype(np.float32)
     lidar = np.column_stack([xy, city.ground.at(xy) + settings.lidar.height]) - origin
@@ -82,4 +91,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(GIVEN)
