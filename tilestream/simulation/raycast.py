@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from tilestream.errors import UsageError
 from tilestream.kernels import cells as _numba_first  # noqa: F401  Open3D brings an older libtbb
+from tilestream.kernels.fixed_order import norms
 from tilestream.records import Float64
 from tilestream.simulation.mesh import Mesh
 
@@ -145,6 +146,6 @@ class Scene:
         ranges[met] = reach[met]
         across = normal[met].astype(np.float64)
         along = np.abs((across * direction[met]).sum(axis=1))
-        cosine[met] = np.minimum(along / np.linalg.norm(across, axis=1), 1.0)
+        cosine[met] = np.minimum(along / norms(across), 1.0)
         material[met] = self._material[triangle[met]]
         return ranges, cosine, material
