@@ -184,7 +184,7 @@ def _leg(
     near, far = KEEP_CLEAR
     cost = 1 + 3 * np.maximum(near - window, 0) ** 2 / near + np.maximum(window - far, 0) / far
     cost[window < MIN_CLEARANCE + 0.25] = np.inf
-    number = np.arange(window.size).reshape(window.shape)
+    number = np.arange(window.size, dtype=np.int32).reshape(window.shape)  # as csgraph counts
     rows, columns, weights = [], [], []
     for dx, dy in ((1, 0), (0, 1), (1, 1), (1, -1)):
         here = (slice(0, -dx or None), slice(max(0, -dy), -dy if dy > 0 else None))
