@@ -18,7 +18,7 @@ STANDING = (FileExistsError, IsADirectoryError, NotADirectoryError, PermissionEr
 """What the disk refuses in the same way however often it is asked."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Outcome:
     """What became of a task."""
 

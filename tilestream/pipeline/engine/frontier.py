@@ -38,12 +38,13 @@ class Frontier:
     def add(self, tasks: Iterable[Task]) -> None:
         """Take more tasks, each after those that it needs; a need that is not known is done."""
         for task in tasks:
-            failed = [self._failed[need] for need in task.needs if need in self._failed]
+            all_needs = task.needs
+            failed = [self._failed[need] for need in all_needs if need in self._failed]
             if failed:
                 self._refused.append(self._refuse(task, failed[0]))
                 continue
             self._tasks[task.key] = task
-            needs = self._tasks.keys() & set(task.needs)
+            needs = self._tasks.keys() & set(all_needs)
             if needs:
                 self._open[task.key] = len(needs)
             else:

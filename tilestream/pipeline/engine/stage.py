@@ -141,7 +141,7 @@ class Task:
         inputs = {name: [one.identity for one in _all(read)] for name, read in self.reads.items()}
         return identity_of(self.stage, self.applies.version, self.takes, inputs)
 
-    @cached_property
+    @property
     def needs(self) -> tuple[str, ...]:
         """Keys of the tasks that must be done before."""
         makers = [key for read in self.reads.values() for one in _all(read) for key in one.makers]
