@@ -45,18 +45,6 @@ LONG = (
 """Files of ten seconds and more, the longest first: what is begun last must be short, or one of
 the processes that the tests run in would wait for another."""
 
-LONGEST = 6
-"""So many of these files take half of the time: `--fast-half` leaves them out."""
-
-
-def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--fast-half", action="store_true", help="without the longest files")
-
-
-def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    name = collection_path.stem.removeprefix("test_")
-    return True if config.getoption("fast_half") and name in LONG[:LONGEST] else None
-
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     order = {f"test_{name}.py": number for number, name in enumerate(LONG)}

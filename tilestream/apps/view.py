@@ -145,7 +145,7 @@ def _opened(*, visible: bool, display: bool) -> Iterator[Any]:
     try:
         with _listening() as told:
             opened = window.create_window("tilestream", WIDTH, HEIGHT, visible=visible)
-        if display and "No display" in told.getvalue():
+        if display and re.search("No display|DISPLAY", told.getvalue()):
             raise DisplayError("no display: run it on a desktop, or with --screenshot F.png")
         if not opened:
             said = "; ".join(re.findall(r"WARNING\] ([^\x1b\n]*)", told.getvalue()))
