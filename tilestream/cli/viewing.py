@@ -45,7 +45,7 @@ def view(
 def legend(scene: Scene) -> list[Text]:
     """What the points are, and what the colours of the places mean."""
     low, high = scene.height_range
-    told = f"map: {len(scene.points):,} of {scene.total:,} points of {len(scene.tiles):,} tiles, "
+    told = f"map: {len(scene.points):,} of {scene.total:,} points, tiles: {len(scene.tiles):,}, "
     lines = [Text(told + f"from dark at {low:.1f} m to bright at {high:.1f} m")]
     measured, known = scene.measured.sum(), np.isfinite(scene.error).sum()
     if len(scene.places):
