@@ -49,10 +49,15 @@ def oblique(points: Float64, aspect: float, field_of_view: float) -> Camera:
     offset, nearer = seen[:, :2], seen[:, 2]
     half = np.tan(field_of_view / 2.0) * np.array([aspect, 1.0])
     aside, depth = offset.mean(axis=0), nearer.mean()
+
+    def far_enough() -> float:
+        return float((ROOM * np.abs(offset - aside) / half + nearer[:, None]).max()) + MARGIN
+
     for _ in range(ROUNDS):
-        back = float((ROOM * np.abs(offset - aside) / half + nearer[:, None]).max()) + MARGIN
+        back = far_enough()
         picture = (offset - aside) / (back - nearer)[:, None]
-        aside += (back - depth) * (picture.max(axis=0) + picture.min(axis=0)) / 2.0
+        aside = aside + (back - depth) * (picture.max(axis=0) + picture.min(axis=0)) / 2.0
+    back = far_enough()  # also where moving aside has not settled
     return Camera(np.append(aside, depth) @ axes, towards, axes[1], back - depth)
 
 
