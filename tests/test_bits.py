@@ -216,9 +216,9 @@ def test_another_processor_agrees_within_what_is_stated(tmp_path: Path) -> None:
     subprocess.run(program, check=True, env=environment)
     here, there = processors.figures(tmp_path / "here"), np.load(tmp_path / "figures.npz")
     np.testing.assert_array_equal(here["cells"], there["cells"])
-    for name in ("factors", "hessian"):
+    for name, close in (("factors", 1e-5), ("hessian", 1e-4)):
         largest = np.nanmax(np.abs(here[name]), axis=0)
-        np.testing.assert_allclose(here[name] / largest, there[name] / largest, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(here[name] / largest, there[name] / largest, rtol=0, atol=close)
     assert (np.abs(here["error"] - there["error"]) < 1e-3).mean() > 0.98
 
 

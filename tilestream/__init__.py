@@ -13,8 +13,9 @@ over tiles are of whole numbers, products and sums of rows are in a fixed order
 (`tests/test_bits.py` says where).
 
 Another processor rounds otherwise in compiled kernels: there points and cells are equal, factors
-and Hessians agree to 1e-5 of a column's largest value, and 98 of 100 starts end within 1 mm of each
-other (registration is chaotic); what is averaged over starts, or learnt from them, moves with them.
+agree to 1e-5 and Hessians to 1e-4 of a column's largest value, and 98 of 100 starts end within 1 mm
+of each other (registration is chaotic); what is averaged over starts, or learnt from them, moves
+with them.
 """
 
 from importlib import import_module
