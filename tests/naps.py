@@ -90,7 +90,18 @@ def stage_named(name: str, body: Callable[..., Any]) -> Stage:
 
 NAPS = {
     name: stage_named(name, napping)
-    for name in ("nap", "after", "spa", "spb", "cells", "terms", "factors", "predict", "merge")
+    for name in (
+        "nap",
+        "after",
+        "spa",
+        "spb",
+        "cells",
+        "terms",
+        "factors",
+        "predict",
+        "merge",
+        "report",
+    )
 }
 SUMS = {name: stage_named(name, summing) for name in ("sum", "other", *"abc")}
 
