@@ -29,8 +29,8 @@ import pandas as pd
 from shinjuku_labels import LIMITS, PAPER
 
 import tilestream as ts
-from tilestream.forest.evaluation import PAPER_TABLE
-from tilestream.forest.protocols import PROTOCOLS
+from tilestream.model.evaluation import PAPER_TABLE
+from tilestream.model.protocols import PROTOCOLS
 
 CM = 100.0
 FIRST = 12

@@ -51,7 +51,7 @@ from tilestream.factors.local_similarity import NEIGHBOUR_RADIUS
 from tilestream.factors.table import factors_at
 from tilestream.factors.terms import tile_terms
 from tilestream.factors.vicinity import TileTerms, vicinity_sums
-from tilestream.formats.pcd import write_pcd
+from tilestream.formats.points.pcd import write_pcd
 from tilestream.kernels import pairs
 from tilestream.kernels.cells import cell_of_points
 from tilestream.kernels.neighbours import neighbours_within

@@ -42,7 +42,7 @@ from tilestream.factors.catalogue import COLUMNS, columns_of
 from tilestream.factors.local_similarity import TEMPERATURE
 from tilestream.factors.table import TermsCache, factors
 from tilestream.factors.vicinity import vicinity_sums
-from tilestream.formats.pcd import write_pcd
+from tilestream.formats.points.pcd import write_pcd
 
 mpl.use("Agg")
 EYE, MIDDLE = 2.08, 50.0

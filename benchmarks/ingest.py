@@ -42,9 +42,9 @@ from street_tiles import drive, long_street
 
 import tilestream as ts
 from tilestream.formats import open_source
-from tilestream.formats.las import write_las
-from tilestream.formats.mcap_write import write_log
-from tilestream.formats.pcd import write_pcd
+from tilestream.formats.logs.mcap_write import write_log
+from tilestream.formats.points.las import write_las
+from tilestream.formats.points.pcd import write_pcd
 from tilestream.records import Scan, Trajectory
 
 HERE = Path(__file__).resolve().parent
@@ -224,7 +224,7 @@ def measure_base() -> int:
     """Peak of a process that has imported everything and ingested a thousand points."""
     code = (
         "import tempfile; import numpy as np; import tilestream.cli;"
-        "import tilestream as ts; from tilestream.formats.pcd import write_pcd;"
+        "import tilestream as ts; from tilestream.formats.points.pcd import write_pcd;"
         "d = tempfile.mkdtemp(); write_pcd(d + '/a.pcd', np.random.rand(1000, 3));"
         "ts.ingest(d + '/a.pcd', d + '/m.zarr');"
         "print(open('/proc/self/status').read().split('VmHWM:')[1].split()[0])"

@@ -48,9 +48,10 @@ import numpy as np
 import pandas as pd
 from forest_data import COLUMNS, LENGTHS, dataset, drives
 
-from tilestream.forest.model_file import load_model, save_model
-from tilestream.forest.reasons import contributions
-from tilestream.forest.training import predict, train
+from tilestream.grid import TileKey
+from tilestream.model.model_file import load_model, save_model
+from tilestream.model.reasons import contributions
+from tilestream.model.training import predict, train
 from tilestream.pipeline.engine.attempt import perform
 from tilestream.pipeline.engine.outputs import Parquet
 from tilestream.pipeline.engine.stage import Product, Task
@@ -62,7 +63,6 @@ from tilestream.pipeline.stages.samples import places_with_factors
 from tilestream.pipeline.stages.train import ModelInUse
 from tilestream.report import Findings
 from tilestream.report.exports import write_geoparquet
-from tilestream.tiling import TileKey
 
 REPEATS = 3
 

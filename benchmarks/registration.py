@@ -43,11 +43,12 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 from scenes import facade, ground, in_map, pole, tree, turned
 
-from tilestream.config import RegistrationSettings
-from tilestream.localization import register, start_poses
+from tilestream.label import start_poses
 from tilestream.ndt import cells_of
 from tilestream.records import Cells
-from tilestream.sensors import VLP16, Sensor
+from tilestream.registration import register
+from tilestream.sensor import VLP16, Sensor
+from tilestream.settings import RegistrationSettings
 
 Floats = NDArray[np.float64]
 GOLDEN = Path(os.environ.get("TILESTREAM_DATA", ROOT.parent / "shared" / "data")) / "matchers"
@@ -275,7 +276,7 @@ def first_call() -> float:
     """Seconds from the start of a fresh process to its first registered scan, warm Numba cache."""
     code = (
         "import sys; sys.path.insert(0, sys.argv[1]); import numpy as np;"
-        "from tilestream.localization import register; from tilestream.ndt import cells_of;"
+        "from tilestream.registration import register; from tilestream.ndt import cells_of;"
         "r = np.random.default_rng(0); p = r.uniform(-20, 20, (60000, 3)); p[:, 2] *= 0.01;"
         "print(register(cells_of(p), p[::50], np.eye(4)).iterations[0])"
     )

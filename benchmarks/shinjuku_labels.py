@@ -44,7 +44,8 @@ import pandas as pd
 from scipy.stats import ks_2samp
 
 import tilestream as ts
-from tilestream.formats.mcap import ScanSelection
+from tilestream.formats.logs.mcap import ScanSelection
+from tilestream.grid import Box
 from tilestream.pipeline.engine.cluster import dask_client
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY
 from tilestream.pipeline.jobs.simulate import SMALL_POINTS, simulate
@@ -53,7 +54,6 @@ from tilestream.simulation.city import build_city
 from tilestream.simulation.drive import scans
 from tilestream.simulation.settings import SimulationSettings, load_preset
 from tilestream.simulation.streets import Street
-from tilestream.tiling import Box
 
 LIMITS = (0.10, 0.15, 0.20, 0.25)
 PAPER = {

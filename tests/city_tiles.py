@@ -15,10 +15,10 @@ from logs import SECOND, START, pose
 from scenes import PLACES, in_map
 
 import tilestream as ts
-from tilestream.config import StartSettings
-from tilestream.formats.las import write_las
+from tilestream.formats.points.las import write_las
 from tilestream.formats.routes import route_of
 from tilestream.pipeline.engine.executor import Watch
+from tilestream.settings import StartSettings
 
 OFFSETS_AT = 155
 """Where the header of a LAS file has its three offsets, then highest and lowest of each axis."""

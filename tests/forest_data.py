@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from tilestream.forest.dataset import Dataset, join
+from tilestream.model.dataset import Dataset, join
 from tilestream.records import Column
 
 Floats = NDArray[np.float64]

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from tilestream.sensors import Sensor
+from tilestream.sensor import Sensor
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -9,8 +9,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from tilestream.config import RegistrationSettings
 from tilestream.records import Cells
+from tilestream.settings import RegistrationSettings
 
 Floats = NDArray[np.float64]
 FACES = ((0, 0, 0), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))

@@ -10,7 +10,7 @@ from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer
 from scipy.spatial.transform import Rotation
 
-from tilestream.formats.mcap_write import ODOMETRY_SCHEMA, POINT_CLOUD_SCHEMA, TF_SCHEMA
+from tilestream.formats.logs.mcap_write import ODOMETRY_SCHEMA, POINT_CLOUD_SCHEMA, TF_SCHEMA
 
 DATATYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 POSE_PARTS = ODOMETRY_SCHEMA[ODOMETRY_SCHEMA.index("=====") :]

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from tilestream.errors import TilestreamError
+from tilestream.grid import TileKey
 from tilestream.pipeline.engine.outputs import Facts, Made
 from tilestream.pipeline.engine.stage import Stage, Task
-from tilestream.tiling import TileKey
 
 MEMORY = 10**9
 """What a nap may use [bytes]."""

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tilestream.forest.models import FORESTS, OPPONENTS
+from tilestream.model.models import FORESTS, OPPONENTS
 from tilestream.records import Float64
 from tilestream.report import Findings, write_report
 

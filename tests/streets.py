@@ -7,7 +7,7 @@ import numpy as np
 from logs import SECOND, START, pose
 from scenes import PLACES, in_map
 
-from tilestream.formats.pcd import write_pcd
+from tilestream.formats.points.pcd import write_pcd
 from tilestream.pipeline.jobs.run_settings import RunSettings
 
 STREETS = {"canyon": 0.0, "tunnel": 400.0, "crossing": 800.0}

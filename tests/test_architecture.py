@@ -11,13 +11,14 @@ import tilestream
 ROOT = Path(tilestream.__file__).parent
 FLOORS = (
     ("errors", "version"),
-    ("tiling", "config", "marks"),
-    ("kernels", "sensors"),
+    ("grid", "settings", "marks"),
+    ("kernels", "sensor"),
     ("records",),
     ("ndt",),
     ("store", "tables", "formats", "simulation"),
-    ("localization",),
-    ("factors", "forest"),
+    ("registration",),
+    ("label",),
+    ("factors", "model"),
     ("report",),
     ("pipeline.engine",),
     ("pipeline.stages",),
@@ -32,8 +33,8 @@ KNOWN_ONLY_BY = {
     "dask": {"pipeline.engine"},
     "distributed": {"pipeline.engine"},
     "zarr": {"store"},
-    "sklearn": {"forest"},
-    "skops": {"forest"},
+    "sklearn": {"model"},
+    "skops": {"model"},
     "numba": {"kernels"},
     "embreex": {"simulation"},
     "open3d": {"simulation", "apps"},
@@ -135,13 +136,13 @@ def test_a_broken_arrow_is_seen() -> None:
     for path, source in (
         (ROOT / "store.py", "from tilestream.pipeline.jobs import run"),
         (ROOT / "ndt.py", "import zarr"),
-        (ROOT / "localization.py", "from tilestream.factors.table import factors"),
+        (ROOT / "label.py", "from tilestream.factors.table import factors"),
         (ROOT / "pipeline" / "engine" / "plan.py", "from tilestream.pipeline.stages import merge"),
-        (ROOT / "ndt.py", "from tilestream import localization"),
+        (ROOT / "ndt.py", "from tilestream import label"),
     ):
         assert broken_arrows(path, source), source
 
 
 def test_floors_do_not_import_each_other() -> None:
-    source = "from tilestream.formats.pcd import write_pcd"
+    source = "from tilestream.formats.points.pcd import write_pcd"
     assert broken_arrows(ROOT / "store.py", source) == ["store.py:1 store imports formats"]

@@ -9,8 +9,8 @@ import pytest
 
 from tilestream.errors import CorruptSourceError, SourceNotFoundError, UnknownFormatError
 from tilestream.formats import describe, expand_sources, open_source
-from tilestream.formats.autoware import open_map_directory
-from tilestream.formats.pcd import write_pcd
+from tilestream.formats.points.autoware import open_map_directory
+from tilestream.formats.points.pcd import write_pcd
 from tilestream.formats.projector import read_projector
 
 METADATA = "x_resolution: 20.0\ny_resolution: 20.0\nb.pcd: [20, 0]\na.pcd: [0.0, 0.0]\n"

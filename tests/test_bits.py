@@ -26,16 +26,16 @@ import tilestream as ts
 from tilestream.factors.local_similarity import covariances, curvatures, entropy
 from tilestream.factors.virtual_drive import COLUMNS as VIRTUAL
 from tilestream.factors.virtual_drive import averaged_along
-from tilestream.forest.dataset import with_derived
-from tilestream.forest.domain import domain_of
-from tilestream.forest.models import COMPETITORS
-from tilestream.forest.protocols import block_splits
-from tilestream.formats.deskew import Sweep, deskew
-from tilestream.formats.lesser import select
-from tilestream.formats.pcd import write_pcd
-from tilestream.formats.poses import interpolate, matrices, transform
+from tilestream.formats.logs.degrade import select
+from tilestream.formats.logs.deskew import Sweep, deskew
+from tilestream.formats.logs.poses import interpolate, matrices, transform
+from tilestream.formats.points.pcd import write_pcd
 from tilestream.kernels.fixed_order import norms, row_sums, turned
-from tilestream.localization import start_errors
+from tilestream.label import start_errors
+from tilestream.model.dataset import with_derived
+from tilestream.model.domain import domain_of
+from tilestream.model.models import COMPETITORS
+from tilestream.model.protocols import block_splits
 from tilestream.records import Scan, Trajectory
 
 Floats = NDArray[np.float64]
@@ -229,12 +229,13 @@ MAY = {
     "factors/local_similarity.py": "the weights of a fit: a constant",
     "factors/observability.py": "6 x 6 of one place",
     "factors/virtual_drive.py": "over the starts of one place",
-    "formats/log_poses.py": "4 x 4 of one pose",
-    "formats/poses.py": "4 x 4 of one pose",
-    "forest/domain.py": "over all training places, in one thread",
-    "forest/reasons.py": "over all training places, in one thread",
+    "formats/logs/log_poses.py": "4 x 4 of one pose",
+    "formats/logs/poses.py": "4 x 4 of one pose",
     "kernels/neighbours.py": "whole numbers",
-    "localization.py": "3 x 3 of one pose or one cell",
+    "label.py": "3 x 3 of one pose",
+    "model/domain.py": "over all training places, in one thread",
+    "model/reasons.py": "over all training places, in one thread",
+    "registration.py": "3 x 3 of one pose or one cell",
     "simulation/drive.py": "over one drive",
     "simulation/lidar.py": "over one scan",
     "simulation/mesh.py": "over one tree",

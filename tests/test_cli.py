@@ -26,10 +26,10 @@ from tilestream.cli.app import COMMANDS, command_of
 from tilestream.cli.options import parse_bytes
 from tilestream.cli.progress import progress
 from tilestream.errors import UsageError
-from tilestream.formats.las import write_las
-from tilestream.formats.mcap import open_log
-from tilestream.formats.pcd import write_pcd
-from tilestream.formats.ply import write_ply
+from tilestream.formats.logs.mcap import open_log
+from tilestream.formats.points.las import write_las
+from tilestream.formats.points.pcd import write_pcd
+from tilestream.formats.points.ply import write_ply
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.cluster import TlsFiles
 

@@ -3,8 +3,8 @@
 import pytest
 
 import tilestream as ts
-from tilestream.config import IngestSettings, RegistrationSettings, Settings
 from tilestream.errors import TilestreamError, UsageError
+from tilestream.settings import IngestSettings, RegistrationSettings, Settings
 
 
 class Job(Settings):

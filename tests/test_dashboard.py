@@ -22,6 +22,7 @@ from naps import MEMORY, Nap
 from patience import wait_until
 from PIL import Image
 
+from tilestream.grid import TileKey
 from tilestream.pipeline.engine.cluster import dask_client
 from tilestream.pipeline.engine.dashboard import (
     GREY,
@@ -45,7 +46,6 @@ from tilestream.pipeline.engine.progress import (
     WAITING,
     Progress,
 )
-from tilestream.tiling import TileKey
 
 EVIL = "<img src=x onerror=\"document.title='taken'\"> & 'quotes'"
 

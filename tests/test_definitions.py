@@ -10,8 +10,8 @@ import pytest
 import tilestream as ts
 from tilestream import definitions
 from tilestream.cli import run
-from tilestream.config import Settings
 from tilestream.errors import UsageError
+from tilestream.settings import Settings
 
 ROOT = Path(definitions.__file__).parent
 CITATION = re.compile(r"definitions, section (\d+(?:\.\d+)?)")

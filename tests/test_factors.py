@@ -15,7 +15,7 @@ from tilestream.factors.catalogue import COLUMNS, COUNTS, columns_of, markdown
 from tilestream.factors.feature_sufficiency import dimensions, shape_shares
 from tilestream.factors.table import TermsCache, factors
 from tilestream.factors.terms import reach_mm, terms_table, tile_terms
-from tilestream.formats.pcd import write_pcd
+from tilestream.formats.points.pcd import write_pcd
 from tilestream.marks import Mark
 from tilestream.store import POINTS, Tile, TileStore
 

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scenes import PLACES, UTM, in_map, scene
 
 import tilestream as ts
-from tilestream.formats.pcd import write_pcd
+from tilestream.formats.points.pcd import write_pcd
 from tilestream.ndt import cells_of
 
 Floats = NDArray[np.float64]

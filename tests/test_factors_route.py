@@ -16,13 +16,13 @@ import tilestream as ts
 from tilestream.cli import run
 from tilestream.errors import SourceError, UsageError
 from tilestream.factors.rows import samples_by_tile
-from tilestream.formats.pcd import write_pcd
+from tilestream.formats.points.pcd import write_pcd
 from tilestream.formats.routes import resample, route_of, write_geojson_route
+from tilestream.grid import TileGrid
 from tilestream.marks import Mark
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.jobs.run_folder import map_of
 from tilestream.store import POINTS, Tile
-from tilestream.tiling import TileGrid
 
 SENSOR = ts.VLP16.model_copy(update={"name": "short", "range_max": 25.0})
 

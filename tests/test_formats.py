@@ -20,9 +20,9 @@ from tilestream.errors import (
     UsageError,
 )
 from tilestream.formats import FORMATS, describe, expand_sources, open_source
-from tilestream.formats.las import write_las
-from tilestream.formats.pcd import write_pcd
-from tilestream.formats.ply import write_ply
+from tilestream.formats.points.las import write_las
+from tilestream.formats.points.pcd import write_pcd
+from tilestream.formats.points.ply import write_ply
 
 Points = NDArray[np.float64]
 HALF_MM = 0.0005 + 1e-9

@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 from killed import killed_after
 
 import tilestream as ts
-from tilestream.config import IngestSettings
 from tilestream.errors import (
     CrsError,
     PartialError,
@@ -27,11 +26,12 @@ from tilestream.errors import (
     UsageError,
 )
 from tilestream.formats import open_source
-from tilestream.formats.las import write_las
-from tilestream.formats.pcd import write_pcd
+from tilestream.formats.points.las import write_las
+from tilestream.formats.points.pcd import write_pcd
 from tilestream.pipeline.engine import plan
 from tilestream.pipeline.jobs import ingest as ingest_map
 from tilestream.pipeline.stages import merge, scatter
+from tilestream.settings import IngestSettings
 from tilestream.store import POINTS
 
 

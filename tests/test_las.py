@@ -12,7 +12,7 @@ import pytest
 
 from tilestream.errors import CorruptSourceError, CrsError
 from tilestream.formats import open_source
-from tilestream.formats.las import open_las, write_las
+from tilestream.formats.points.las import open_las, write_las
 
 
 def points_of(path: Path, span_points: int = 10**6, block_points: int = 777) -> np.ndarray:

@@ -33,7 +33,7 @@ from literal import (
 from numpy.typing import NDArray
 from scenes import PLACES, UTM, ball, in_map, jittered, pole, rotated_scene, scene
 
-from tilestream.sensors import HDL64, VLP16
+from tilestream.sensor import HDL64, VLP16
 
 Floats = NDArray[np.float64]
 EYE = np.array([10.0, 0.0, 2.0])

@@ -17,12 +17,11 @@ from scenes import PLACES, in_map
 
 import tilestream as ts
 from tilestream.cli import run
-from tilestream.config import StartSettings
 from tilestream.errors import PartialError, PoseError, TileNotReadyError, UsageError
-from tilestream.formats.lesser import as_lesser
-from tilestream.formats.mcap import open_log
-from tilestream.formats.pcd import write_pcd
-from tilestream.localization import refined_pose, start_poses
+from tilestream.formats.logs.degrade import as_lesser
+from tilestream.formats.logs.mcap import open_log
+from tilestream.formats.points.pcd import write_pcd
+from tilestream.label import refined_pose, start_poses
 from tilestream.marks import Mark
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.jobs.localize import REACH, choose_samples
@@ -31,6 +30,7 @@ from tilestream.pipeline.stages.drive_scans import Reading
 from tilestream.pipeline.stages.label import ERROR_COLUMNS
 from tilestream.pipeline.stages.register import START_COLUMNS
 from tilestream.records import Cells
+from tilestream.settings import StartSettings
 from tilestream.store import POINTS, Tile
 from tilestream.tables import read_mark, read_tables
 

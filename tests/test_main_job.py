@@ -35,12 +35,12 @@ from tilestream.errors import (
     UsageError,
 )
 from tilestream.factors.virtual_scan import VirtualSettings
-from tilestream.forest import evaluation, models, training
-from tilestream.forest.dataset import TARGETS
-from tilestream.forest.intervals import coverage
-from tilestream.forest.model_file import load_model, save_model
-from tilestream.forest.models import Recipe
-from tilestream.forest.training import PREDICTION_COLUMNS
+from tilestream.model import evaluation, models, training
+from tilestream.model.dataset import TARGETS
+from tilestream.model.intervals import coverage
+from tilestream.model.model_file import load_model, save_model
+from tilestream.model.models import Recipe
+from tilestream.model.training import PREDICTION_COLUMNS
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.cluster import dask_client
 from tilestream.pipeline.engine.costs import calibration_file, core_hours, learn

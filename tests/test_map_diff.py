@@ -13,9 +13,9 @@ from tilestream.apps.diff import diff
 from tilestream.cli import run
 from tilestream.errors import StoreNotFoundError, UsageError
 from tilestream.factors.rows import PLACE_COLUMNS
-from tilestream.forest.training import PREDICTION_COLUMNS
-from tilestream.formats.pcd import write_pcd
+from tilestream.formats.points.pcd import write_pcd
 from tilestream.marks import Mark
+from tilestream.model.training import PREDICTION_COLUMNS
 from tilestream.tables import write_table
 
 

@@ -14,10 +14,10 @@ from mcap.writer import CompressionType, IndexType
 from scipy.spatial.transform import Rotation
 
 from tilestream.errors import PoseError, SourceError, UsageError
-from tilestream.formats.mcap import ScanSelection, open_drive, open_log
-from tilestream.formats.mcap_file import McapFile
-from tilestream.formats.mcap_write import LogWriter, write_log
-from tilestream.formats.poses import PoseStatus
+from tilestream.formats.logs.mcap import ScanSelection, open_drive, open_log
+from tilestream.formats.logs.mcap_file import McapFile
+from tilestream.formats.logs.mcap_write import LogWriter, write_log
+from tilestream.formats.logs.poses import PoseStatus
 from tilestream.records import Scan, Trajectory
 
 MAKES: dict[str, dict[str, Any]] = {

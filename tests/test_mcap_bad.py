@@ -21,7 +21,7 @@ from tilestream.errors import (
     TilestreamError,
     UnknownFormatError,
 )
-from tilestream.formats.mcap import open_drive, open_log
+from tilestream.formats.logs.mcap import open_drive, open_log
 
 
 @pytest.fixture(scope="module")

@@ -30,11 +30,12 @@ from tilestream.factors.virtual_drive import (
     weighted_median,
 )
 from tilestream.factors.virtual_scan import Beams, Scene, VirtualSettings, cast
-from tilestream.formats.pcd import write_pcd
-from tilestream.localization import localization_error, register
+from tilestream.formats.points.pcd import write_pcd
+from tilestream.grid import Box
+from tilestream.label import localization_error
 from tilestream.marks import Mark
+from tilestream.registration import register
 from tilestream.store import POINTS, Tile
-from tilestream.tiling import Box
 
 SENSOR = ts.VLP16.model_copy(update={"name": "short", "range_max": 15.0, "azimuth_step_deg": 3.0})
 SEEING = VirtualSettings(starts=8)

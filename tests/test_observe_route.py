@@ -15,7 +15,7 @@ from tilestream.errors import PlanError, UsageError
 from tilestream.factors.observability import observability
 from tilestream.factors.rows import samples_by_tile
 from tilestream.factors.virtual_scan import VirtualSettings
-from tilestream.formats.pcd import write_pcd
+from tilestream.formats.points.pcd import write_pcd
 from tilestream.formats.routes import route_of
 from tilestream.marks import Mark
 from tilestream.pipeline.engine.attempt import Outcome

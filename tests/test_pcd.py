@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from tilestream.errors import CorruptSourceError
 from tilestream.formats import open_source
-from tilestream.formats.pcd import write_pcd
+from tilestream.formats.points.pcd import write_pcd
 
 # 40 points of XYZI that PCL 1.13 (pcl::PCDWriter::writeBinaryCompressed) wrote for this test:
 # x = 0.5 (i // 4), y = -1.25 + i, z = 0.1 (i % 5), intensity = 7

@@ -8,7 +8,7 @@ import pytest
 
 from tilestream.errors import CorruptSourceError, UnknownFormatError
 from tilestream.formats import open_source
-from tilestream.formats.ply import write_ply
+from tilestream.formats.points.ply import write_ply
 
 HEADER = """ply
 format ascii 1.0

@@ -13,8 +13,8 @@ from streets import street as street_of
 
 from tilestream.cli import run
 from tilestream.cli.app import COMMANDS, command_of
-from tilestream.formats.las import write_las
-from tilestream.formats.pcd import write_pcd
+from tilestream.formats.points.las import write_las
+from tilestream.formats.points.pcd import write_pcd
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text()

@@ -12,12 +12,13 @@ from hypothesis import strategies as st
 from literal_registration import Floats, Matcher, euler_angles, expm, from_euler, thinned
 from scenes import UTM, rotated_scene, scene
 
-from tilestream.config import RegistrationSettings, StartSettings
 from tilestream.errors import RegistrationError, UsageError
 from tilestream.kernels.newton import definite_step, raw_step
-from tilestream.localization import register, start_poses
+from tilestream.label import start_poses
 from tilestream.ndt import cells_of
 from tilestream.records import Cells, Registrations
+from tilestream.registration import register
+from tilestream.settings import RegistrationSettings, StartSettings
 
 SCORE_ONLY = {"iterations_max": 0}
 MODES = {
@@ -451,7 +452,7 @@ import numpy as np
 sys.path.insert(0, sys.argv[1])
 from test_registration import MODES, T_MAP_LIDAR, scan_of, starts_around
 from scenes import scene
-from tilestream.localization import register
+from tilestream.registration import register
 from tilestream.ndt import cells_of
 cells = cells_of(scene("canyon", 1, size=8.0), 2.0)
 T = T_MAP_LIDAR.copy()

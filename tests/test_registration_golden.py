@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from literal_registration import Floats, Matcher
 
-from tilestream.config import RegistrationSettings
-from tilestream.localization import register
 from tilestream.ndt import cells_of
 from tilestream.records import Cells, Registrations
+from tilestream.registration import register
+from tilestream.settings import RegistrationSettings
 
 
 class Golden:

@@ -28,9 +28,9 @@ from report_findings import (
 from report_json import charts, source
 
 import tilestream.report
-from tilestream.forest.dataset import TARGETS
-from tilestream.forest.models import COMPETITORS
-from tilestream.forest.protocols import PROTOCOLS
+from tilestream.model.dataset import TARGETS
+from tilestream.model.models import COMPETITORS
+from tilestream.model.protocols import PROTOCOLS
 from tilestream.report import Findings, write_report
 from tilestream.report.charts import path_chart
 from tilestream.report.evaluation import MODELS, PAPER_IMPORTANCES, PARTS, PROTOCOL_NAMES

@@ -25,6 +25,7 @@ from naps import MEMORY, ORDER, After, Nap, Sum
 from patience import wait_until
 
 from tilestream.errors import PlanError, TaskError, UsageError
+from tilestream.grid import TileKey
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.cluster import dask_client, report_kept
 from tilestream.pipeline.engine.dask_executor import _Workers
@@ -32,7 +33,6 @@ from tilestream.pipeline.engine.executor import execute
 from tilestream.pipeline.engine.frontier import Frontier
 from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.engine.stage import BASE_BYTES, Task
-from tilestream.tiling import TileKey
 
 
 def planned(tasks: Sequence[Task]) -> Plan:
@@ -357,7 +357,7 @@ from naps import MEMORY, Nap
 from tilestream.pipeline.engine.cluster import dask_client
 from tilestream.pipeline.engine.executor import execute
 from tilestream.pipeline.engine.plan import Plan
-from tilestream.tiling import TileKey
+from tilestream.grid import TileKey
 
 if __name__ == "__main__":
     naps = [Nap(TileKey(i, 0)) for i in range(3)]
@@ -413,7 +413,7 @@ from naps import MEMORY, Nap
 from tilestream.pipeline.engine.cluster import dask_client
 from tilestream.pipeline.engine.executor import execute
 from tilestream.pipeline.engine.plan import Plan
-from tilestream.tiling import TileKey
+from tilestream.grid import TileKey
 
 with dask_client(sys.argv[1], None, 1) as client:
     execute(Plan((Nap(TileKey(0, 0), after=3.0, notes=sys.argv[2]),), MEMORY), client, None)

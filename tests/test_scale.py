@@ -93,7 +93,7 @@ sys.path.insert(0, {tests!r})
 from naps import MEMORY, Nap
 from tilestream.pipeline.engine.executor import execute
 from tilestream.pipeline.engine.plan import Plan
-from tilestream.tiling import TileKey
+from tilestream.grid import TileKey
 
 def resident():
     return int(open("/proc/self/status").read().split("VmHWM:")[1].split()[0]) * 1024

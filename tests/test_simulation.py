@@ -16,7 +16,7 @@ from tilestream.errors import (
     UsageError,
 )
 from tilestream.pipeline.jobs.simulate import require_space
-from tilestream.sensors import VLP16
+from tilestream.sensor import VLP16
 from tilestream.simulation.footprints import Footprints, read_footprints
 from tilestream.simulation.lidar import measure, turn_of
 from tilestream.simulation.mesh import Material, boxes, joined, walls

@@ -18,13 +18,13 @@ from killed import killed_after
 
 import tilestream as ts
 from tilestream.cli import run
-from tilestream.config import StartSettings
 from tilestream.errors import PlanError, UsageError
-from tilestream.formats.mcap import ScanSelection, open_log
+from tilestream.formats.logs.mcap import ScanSelection, open_log
 from tilestream.pipeline.engine.stage import BASE_BYTES
 from tilestream.pipeline.jobs.simulate import plan_simulation, simulate
 from tilestream.pipeline.stages import simulated
 from tilestream.records import Scan
+from tilestream.settings import StartSettings
 from tilestream.simulation.city import City, build_city
 from tilestream.simulation.drive import motion_of, scans, traffic_of
 from tilestream.simulation.settings import (

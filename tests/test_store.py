@@ -20,11 +20,11 @@ from tilestream.errors import (
     TileNotReadyError,
     UsageError,
 )
-from tilestream.formats.pcd import write_pcd
+from tilestream.formats.points.pcd import write_pcd
+from tilestream.grid import TileKey
 from tilestream.marks import MISSING, Mark, hash_of, identity_of
 from tilestream.store import POINTS, Tile, cells_table
 from tilestream.tables import read_mark
-from tilestream.tiling import TileKey
 
 
 def make_store(folder: Path, points: np.ndarray, **settings: float) -> ts.TileStore:

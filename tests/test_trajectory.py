@@ -11,10 +11,10 @@ from logs import SECOND, START, pose
 from scipy.spatial.transform import Rotation, Slerp
 
 from tilestream.errors import PoseError, UsageError
-from tilestream.formats.deskew import Sweep, deskew
-from tilestream.formats.lesser import as_lesser
-from tilestream.formats.mcap import open_log
-from tilestream.formats.poses import (
+from tilestream.formats.logs.degrade import as_lesser
+from tilestream.formats.logs.deskew import Sweep, deskew
+from tilestream.formats.logs.mcap import open_log
+from tilestream.formats.logs.poses import (
     PoseStatus,
     compose,
     interpolate,
@@ -22,7 +22,7 @@ from tilestream.formats.poses import (
     path_between,
     transform,
 )
-from tilestream.formats.poses import trajectory as ordered
+from tilestream.formats.logs.poses import trajectory as ordered
 from tilestream.records import Scan, Trajectory
 
 

@@ -25,7 +25,7 @@ from tilestream.factors.vicinity import (
 from tilestream.kernels import azimuth
 from tilestream.kernels.cells import cell_sums
 from tilestream.kernels.depth_image import thin
-from tilestream.sensors import HDL64, OS1_128, VLP16, Sensor
+from tilestream.sensor import HDL64, OS1_128, VLP16, Sensor
 
 Floats = NDArray[np.float64]
 NARROW = Sensor(

@@ -25,9 +25,9 @@ from tilestream.apps.scene import scene_of
 from tilestream.cli import run
 from tilestream.errors import StoreNotFoundError, TileNotReadyError, UsageError
 from tilestream.factors.rows import PLACE_COLUMNS
-from tilestream.forest.training import PREDICTION_COLUMNS
-from tilestream.formats.pcd import write_pcd
+from tilestream.formats.points.pcd import write_pcd
 from tilestream.marks import Mark
+from tilestream.model.training import PREDICTION_COLUMNS
 from tilestream.pipeline.jobs.run_folder import map_of
 from tilestream.pipeline.stages.label import ERROR_COLUMNS
 from tilestream.records import Column

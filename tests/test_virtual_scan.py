@@ -28,13 +28,13 @@ from tilestream.factors.virtual_scan import (
     probability,
     virtual_scan,
 )
-from tilestream.formats.pcd import write_pcd
+from tilestream.formats.points.pcd import write_pcd
+from tilestream.grid import Box
 from tilestream.kernels.cells import cell_sums
 from tilestream.kernels.depth_image import thin
 from tilestream.kernels.surfels import NORMAL_ONE, surfels_of
 from tilestream.kernels.virtual_scan import cast
 from tilestream.marks import Mark
-from tilestream.tiling import Box
 
 Floats = np.ndarray
 EDGE = 200

@@ -10,11 +10,11 @@ from tilestream.factors.ghosts import ghosts_among
 from tilestream.factors.observability import whole_places
 from tilestream.factors.surfels import surfel_mm, surfels_in
 from tilestream.factors.virtual_scan import Scene
-from tilestream.formats.mcap import open_log
+from tilestream.formats.logs.mcap import open_log
+from tilestream.grid import Box
 from tilestream.kernels.virtual_scan import cast
 from tilestream.pipeline.jobs.simulate import simulate
 from tilestream.simulation.settings import load_preset
-from tilestream.tiling import Box
 
 NEAR, REACH = 1_000.0, 76_000.0
 """Of the beams that are cast [mm]."""

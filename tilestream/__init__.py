@@ -21,20 +21,18 @@ with them.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from tilestream.config import RegistrationSettings as RegistrationSettings
-from tilestream.config import StartSettings as StartSettings
 from tilestream.factors.observability import observability as observability
 from tilestream.factors.sample_points import sample_points as sample_points
 from tilestream.factors.table import factors as factors
 from tilestream.factors.virtual_scan import VirtualSettings as VirtualSettings
-from tilestream.formats.mcap import ScanSelection as ScanSelection
+from tilestream.formats.logs.mcap import ScanSelection as ScanSelection
 from tilestream.formats.routes import read_route as read_route
 from tilestream.formats.routes import read_routes as read_routes
-from tilestream.localization import disc_starts as disc_starts
-from tilestream.localization import localization_error as localization_error
-from tilestream.localization import refined_pose as refined_pose
-from tilestream.localization import register as register
-from tilestream.localization import start_poses as start_poses
+from tilestream.grid import TileKey as TileKey
+from tilestream.label import disc_starts as disc_starts
+from tilestream.label import localization_error as localization_error
+from tilestream.label import refined_pose as refined_pose
+from tilestream.label import start_poses as start_poses
 from tilestream.ndt import cells_of as cells_of
 from tilestream.pipeline.jobs.along_routes import factors_along as factors_along
 from tilestream.pipeline.jobs.along_routes import observe_along as observe_along
@@ -44,14 +42,16 @@ from tilestream.records import Cells as Cells
 from tilestream.records import LocalizationError as LocalizationError
 from tilestream.records import Registrations as Registrations
 from tilestream.records import Route as Route
-from tilestream.sensors import HDL64 as HDL64
-from tilestream.sensors import OS1_128 as OS1_128
-from tilestream.sensors import VLP16 as VLP16
-from tilestream.sensors import Sensor as Sensor
+from tilestream.registration import register as register
+from tilestream.sensor import HDL64 as HDL64
+from tilestream.sensor import OS1_128 as OS1_128
+from tilestream.sensor import VLP16 as VLP16
+from tilestream.sensor import Sensor as Sensor
+from tilestream.settings import RegistrationSettings as RegistrationSettings
+from tilestream.settings import StartSettings as StartSettings
 from tilestream.store import Tile as Tile
 from tilestream.store import TileStore as TileStore
 from tilestream.store import open_store as open_store
-from tilestream.tiling import TileKey as TileKey
 from tilestream.version import VERSION
 
 if TYPE_CHECKING:

@@ -4,10 +4,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tilestream.errors import UsageError
+from tilestream.grid import MM_PER_M, whole_mm
 from tilestream.kernels.cells import EXACT_MM, cell_sums, moments
 from tilestream.kernels.scatter import round_to_mm
 from tilestream.records import Cells, Int64
-from tilestream.tiling import MM_PER_M, whole_mm
 
 MIN_POINTS = 6
 """Least number of map points of a cell."""

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tilestream.errors import UsageError
+from tilestream.grid import MM_PER_M, whole_mm
 from tilestream.kernels import cells as kernels
-from tilestream.tiling import MM_PER_M, whole_mm
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]

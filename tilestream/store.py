@@ -32,10 +32,10 @@ from tilestream.errors import (
     TileNotReadyError,
     UsageError,
 )
+from tilestream.grid import MM_PER_M, Box, TileGrid, TileKey, whole_mm
 from tilestream.marks import MISSING, Mark, hash_of, identity_of
 from tilestream.ndt import cells_of_mm
 from tilestream.records import Cells, Float64, Int64
-from tilestream.tiling import MM_PER_M, Box, TileGrid, TileKey, whole_mm
 from tilestream.version import VERSION
 
 SCHEMA = 2

@@ -13,10 +13,10 @@ from typing import Any
 
 import pandas as pd
 
-from tilestream.config import RegistrationSettings
 from tilestream.errors import PartialError, UsageError
 from tilestream.factors.rows import in_route_order, samples_by_tile
 from tilestream.factors.virtual_scan import VirtualSettings
+from tilestream.grid import MM_PER_M, whole_mm
 from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, paths_of
 from tilestream.pipeline.engine.stage import Task
@@ -25,10 +25,10 @@ from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.observe import Observing, observe
 from tilestream.records import Route
 from tilestream.report.comparison import CELL_COLUMNS, ROW_COLUMNS, USUAL, Comparison
-from tilestream.sensors import Sensor
+from tilestream.sensor import Sensor
+from tilestream.settings import RegistrationSettings
 from tilestream.store import TileStore, cells_table
 from tilestream.tables import read_tables, remove_others
-from tilestream.tiling import MM_PER_M, whole_mm
 
 SPACING = 5.0
 """Distance between sample points [m]: a comparison needs fewer than an estimate."""

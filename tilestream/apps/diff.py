@@ -8,8 +8,8 @@ import pandas as pd
 from scipy.spatial import cKDTree
 
 from tilestream.errors import UsageError
+from tilestream.grid import TileKey
 from tilestream.pipeline.jobs.run_folder import map_of, rows_of
-from tilestream.tiling import TileKey
 
 SAME_PLACE = 0.5
 """Sample points this near to each other are compared [m]: half their spacing."""

@@ -17,11 +17,11 @@ from scipy.spatial import cKDTree
 
 from tilestream.apps.diff import SAME_PLACE
 from tilestream.errors import TileNotReadyError, UsageError
+from tilestream.grid import MM_PER_M, Box, TileKey
 from tilestream.pipeline.jobs.run_folder import map_of, rows_of
 from tilestream.records import Float64
 from tilestream.report.colours import Scale, scale_of
 from tilestream.store import TileStore
-from tilestream.tiling import MM_PER_M, Box, TileKey
 
 MOST_POINTS = 2_000_000
 """Map points that a view shows: what a laptop turns smoothly."""

@@ -18,7 +18,7 @@ from matplotlib.image import imsave
 from tilestream.apps.camera import oblique
 from tilestream.apps.scene import MOST_POINTS, Scene, scene_of
 from tilestream.errors import DisplayError, UsageError
-from tilestream.formats.rows import writing_whole
+from tilestream.formats.points.rows import writing_whole
 from tilestream.kernels import cells as _numba_first  # noqa: F401  Open3D brings an older libtbb
 from tilestream.report.pictures import NOTHING
 

@@ -6,11 +6,11 @@ from typing import Annotated, Any, Literal
 import typer
 import yaml
 
-from tilestream.config import RegistrationSettings
 from tilestream.errors import UsageError
 from tilestream.formats.routes import read_routes
 from tilestream.records import Route
-from tilestream.sensors import SENSORS, Sensor
+from tilestream.sensor import SENSORS, Sensor
+from tilestream.settings import RegistrationSettings
 
 Matcher = Annotated[
     Literal["default", "autoware"], typer.Option(help="Ours, or the production matcher.")

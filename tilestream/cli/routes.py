@@ -39,12 +39,11 @@ from tilestream.cli.tables import (
     factor_table,
     plan_table,
 )
-from tilestream.config import StartSettings
 from tilestream.errors import PartialError
 from tilestream.factors.catalogue import Which
 from tilestream.factors.rows import samples_by_tile
 from tilestream.factors.virtual_scan import VirtualSettings
-from tilestream.formats.mcap import ScanSelection
+from tilestream.formats.logs.mcap import ScanSelection
 from tilestream.pipeline.jobs import along_routes
 from tilestream.pipeline.jobs import localize as localize_drive
 from tilestream.pipeline.stages.drive_scans import Reading
@@ -53,7 +52,8 @@ from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.records import TruePose
 from tilestream.report import write_comparison
 from tilestream.report.segments import check_threshold
-from tilestream.sensors import SENSORS
+from tilestream.sensor import SENSORS
+from tilestream.settings import StartSettings
 from tilestream.store import open_store
 
 

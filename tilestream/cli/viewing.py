@@ -10,8 +10,8 @@ from rich.text import Text
 from tilestream.apps.scene import MOST_POINTS, Scene, scene_of
 from tilestream.apps.view import require_display, show
 from tilestream.cli.printing import out
+from tilestream.grid import TileKey
 from tilestream.report.colours import STEPS, palette
-from tilestream.tiling import TileKey
 
 RAMP = 24
 """Characters of the legend's ramp of colours."""

@@ -14,7 +14,6 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from tilestream.config import RegistrationSettings
 from tilestream.errors import RegistrationError, TileNotReadyError, UsageError
 from tilestream.factors import virtual_drive
 from tilestream.factors.ghosts import REACH_EDGES, ghosts_among
@@ -30,13 +29,14 @@ from tilestream.factors.virtual_scan import (
     near_share,
     virtual_scan,
 )
-from tilestream.formats.poses import transform
+from tilestream.formats.logs.poses import transform
+from tilestream.grid import MM_PER_M, Box
 from tilestream.kernels.cells import cell_of_points, cell_sums
-from tilestream.localization import register
 from tilestream.records import Cells, Column, Float64, Int64
-from tilestream.sensors import VLP16, Sensor
+from tilestream.registration import register
+from tilestream.sensor import VLP16, Sensor
+from tilestream.settings import RegistrationSettings
 from tilestream.store import TileStore
-from tilestream.tiling import MM_PER_M, Box
 
 BLOCK = 25.0
 """Sample points within a square of this edge share a scene [m]."""

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from tilestream.errors import UsageError
 from tilestream.factors.sample_points import raised
 from tilestream.formats.routes import resample
+from tilestream.grid import MM_PER_M, TileGrid, TileKey
 from tilestream.records import Column, Float64, Int64, Route
 from tilestream.store import TileStore
-from tilestream.tiling import MM_PER_M, TileGrid, TileKey
 
 PLACE_COLUMNS = (
     Column("route_id", "place", "", "Name of the route.", "", dtype="str"),

@@ -5,9 +5,9 @@ from numpy.typing import ArrayLike
 
 from tilestream.errors import UsageError
 from tilestream.formats.routes import resample
+from tilestream.grid import MM_PER_M, Box, TileKey
 from tilestream.records import Float64, Int64, Route
 from tilestream.store import POINTS, Tile, TileStore
-from tilestream.tiling import MM_PER_M, Box, TileKey
 
 GROUND_RADIUS_MM = 1000
 """Horizontal distance around a place within which map points give the ground [mm]."""

@@ -11,12 +11,12 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from tilestream.grid import Box, TileKey, whole_mm
 from tilestream.kernels.cells import cell_sums
 from tilestream.kernels.depth_image import thin
 from tilestream.kernels.surfels import surfels_of
 from tilestream.records import Int64
 from tilestream.store import Tile, TileStore, TileTable
-from tilestream.tiling import Box, TileKey, whole_mm
 
 SURFELS_VERSION = 1
 """Raise it when the surfels that are made from the same points change."""

@@ -12,10 +12,10 @@ from tilestream.errors import TileNotReadyError, UsageError
 from tilestream.factors.catalogue import COUNTS, CRITERIA, Which, columns_of
 from tilestream.factors.terms import terms_table
 from tilestream.factors.vicinity import TileTerms, vicinity_sums
+from tilestream.grid import MM_PER_M, Box, TileKey, whole_mm
 from tilestream.records import Float64, Int64
-from tilestream.sensors import VLP16, Sensor
+from tilestream.sensor import VLP16, Sensor
 from tilestream.store import POINTS, Tile, TileStore
-from tilestream.tiling import MM_PER_M, Box, TileKey, whole_mm
 
 CHUNK = 256
 """Sample points whose sums are held at once: 45 MB."""

@@ -8,12 +8,12 @@ import numpy as np
 
 from tilestream.factors.catalogue import CRITERIA
 from tilestream.factors.vicinity import Terms, TileTerms
+from tilestream.grid import MM_PER_M, Box, TileKey, whole_mm
 from tilestream.kernels.cells import cell_of_points, cell_sums, moments
 from tilestream.kernels.depth_image import thin
 from tilestream.ndt import MIN_POINTS
 from tilestream.records import Cells, Int64
 from tilestream.store import POINTS, Tile, TileStore, TileTable, cells_table
-from tilestream.tiling import MM_PER_M, Box, TileKey, whole_mm
 
 TERMS_VERSION = 2
 """Raise it when the terms that are made from the same points change."""

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tilestream.errors import UsageError
+from tilestream.grid import MM_PER_M
 from tilestream.kernels import depth_image
 from tilestream.kernels import vicinity as kernels
 from tilestream.records import Float64, Int64
-from tilestream.sensors import Sensor
-from tilestream.tiling import MM_PER_M
+from tilestream.sensor import Sensor
 
 Terms = dict[str, NDArray[Any]]
 Sums = dict[str, NDArray[Any]]

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from tilestream.config import Settings
 from tilestream.factors.surfels import Surfels
+from tilestream.grid import MM_PER_M
 from tilestream.kernels.fixed_order import turned
 from tilestream.kernels.surfels import NORMAL_ONE
 from tilestream.kernels.virtual_scan import (
@@ -25,8 +25,8 @@ from tilestream.kernels.virtual_scan import (
     mark_bricks,
 )
 from tilestream.records import Float64, Int64
-from tilestream.sensors import Sensor
-from tilestream.tiling import MM_PER_M
+from tilestream.sensor import Sensor
+from tilestream.settings import Settings
 
 COLUMN_MM = 10_000
 """Edge of the columns that tell where the map has anything [mm]."""

@@ -15,18 +15,18 @@ from tilestream.errors import (
     UnknownFormatError,
     UsageError,
 )
-from tilestream.formats.autoware import is_map_directory, open_map_directory
 from tilestream.formats.base import Block, PointSource, SourceInfo, Span
-from tilestream.formats.las import MAGIC as LAS_MAGIC
-from tilestream.formats.las import open_las
-from tilestream.formats.mcap import open_drive
-from tilestream.formats.pcd import looks_like_pcd, open_pcd
-from tilestream.formats.ply import MAGIC as PLY_MAGIC
-from tilestream.formats.ply import looks_like_ply, open_ply
+from tilestream.formats.logs.mcap import open_drive
+from tilestream.formats.points.autoware import is_map_directory, open_map_directory
+from tilestream.formats.points.las import MAGIC as LAS_MAGIC
+from tilestream.formats.points.las import open_las
+from tilestream.formats.points.pcd import looks_like_pcd, open_pcd
+from tilestream.formats.points.ply import MAGIC as PLY_MAGIC
+from tilestream.formats.points.ply import looks_like_ply, open_ply
 from tilestream.records import Float64
 
 try:
-    from tilestream.formats import e57
+    from tilestream.formats.points import e57
 except ModuleNotFoundError as missing:
     if missing.name != "pye57":
         raise

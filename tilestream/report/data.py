@@ -9,7 +9,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from tilestream.errors import UsageError
-from tilestream.forest.training import PREDICTION_COLUMNS
+from tilestream.model.training import PREDICTION_COLUMNS
 from tilestream.records import Float64
 
 PLACE_COLUMNS = ("route_id", "sample", "arc_length", "heading", "x", "y", "z")

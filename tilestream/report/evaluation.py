@@ -3,8 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from tilestream.forest.models import FORESTS, OPPONENTS, OTHERS
-from tilestream.forest.protocols import PROTOCOLS
+from tilestream.model.models import FORESTS, OPPONENTS, OTHERS
+from tilestream.model.protocols import PROTOCOLS
 from tilestream.report.formatting import known
 
 Row = Mapping[str, Any]

@@ -16,10 +16,10 @@ from pyproj.exceptions import CRSError
 from tilestream.errors import CrsError
 from tilestream.factors import catalogue, observability
 from tilestream.factors.rows import PLACE_COLUMNS
-from tilestream.forest.dataset import SPREAD_ACROSS, SPREAD_ALONG, WEAK_ALONG
-from tilestream.forest.training import PREDICTION_COLUMNS
-from tilestream.formats.pcd import write_pcd
-from tilestream.formats.rows import writing_whole
+from tilestream.formats.points.pcd import write_pcd
+from tilestream.formats.points.rows import writing_whole
+from tilestream.model.dataset import SPREAD_ACROSS, SPREAD_ALONG, WEAK_ALONG
+from tilestream.model.training import PREDICTION_COLUMNS
 from tilestream.records import Float64
 from tilestream.report.colours import scale_of
 from tilestream.report.data import Findings, estimates

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from tilestream.forest.evaluation import PAPER_TABLE, figures
-from tilestream.forest.training import PREDICTION_COLUMNS
+from tilestream.model.evaluation import PAPER_TABLE, figures
+from tilestream.model.training import PREDICTION_COLUMNS
 from tilestream.records import Float64, Int64
 from tilestream.report.data import PLACE_COLUMNS, Findings, estimates, like_training
 from tilestream.report.formatting import cm, distance, known, percent, thousands

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tilestream.records import Float64, Int64, Scan
-from tilestream.sensors import Sensor
+from tilestream.sensor import Sensor
 from tilestream.simulation.mesh import REFLECTIVITY, Material
 from tilestream.simulation.settings import LidarSettings, stream
 

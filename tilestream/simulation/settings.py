@@ -9,9 +9,9 @@ import numpy as np
 import yaml
 from pydantic import Field
 
-from tilestream.config import Settings
 from tilestream.errors import SourceNotFoundError, UsageError
-from tilestream.sensors import HDL64, OS1_128, VLP16, Sensor
+from tilestream.sensor import HDL64, OS1_128, VLP16, Sensor
+from tilestream.settings import Settings
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Length = Annotated[float, Field(ge=0.0)]

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple, Protocol
 
 import pandas as pd
 
+from tilestream.grid import TileKey
 from tilestream.marks import Mark
 from tilestream.records import Column
 from tilestream.store import Tile, open_store
 from tilestream.tables import read_mark, read_tables, write_table
-from tilestream.tiling import TileKey
 
 Facts = Mapping[str, Any]
 

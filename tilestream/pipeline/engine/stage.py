@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Protocol
 
+from tilestream.grid import TileKey
 from tilestream.marks import identity_of
 from tilestream.pipeline.engine.outputs import Output
 from tilestream.records import Column
-from tilestream.tiling import TileKey
 
 BASE_BYTES = 350_000_000
 """Memory of a worker process before its first task: Python, NumPy, Numba, Zarr, Dask (measured

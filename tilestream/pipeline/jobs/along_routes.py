@@ -6,21 +6,21 @@ from typing import Any
 
 import pandas as pd
 
-from tilestream.config import RegistrationSettings
 from tilestream.errors import PartialError
 from tilestream.factors.catalogue import Which
 from tilestream.factors.rows import Samples, in_route_order, samples_by_tile
 from tilestream.factors.virtual_scan import VirtualSettings
+from tilestream.grid import TileKey, whole_mm
 from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, paths_of
 from tilestream.pipeline.stages.factors import Looking, factors, factors_task
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.observe import Observing, observe, observe_task
 from tilestream.records import Route
-from tilestream.sensors import VLP16, Sensor
+from tilestream.sensor import VLP16, Sensor
+from tilestream.settings import RegistrationSettings
 from tilestream.store import TileStore
 from tilestream.tables import read_tables, remove_others
-from tilestream.tiling import TileKey, whole_mm
 
 SENSOR_HEIGHT = 2.0
 """Height of the lidar above the road [m] (the paper's vehicle)."""

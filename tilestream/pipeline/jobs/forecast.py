@@ -6,6 +6,7 @@ import numpy as np
 
 from tilestream.errors import StoreNotFoundError
 from tilestream.formats import describe
+from tilestream.grid import MM_PER_M, Box, TileKey
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.stage import Task
 from tilestream.pipeline.jobs.ingest import plan_ingest
@@ -26,7 +27,6 @@ from tilestream.pipeline.jobs.simulate import plan_simulation
 from tilestream.pipeline.stages.map_plan import MapPlan, TilePoints
 from tilestream.pipeline.stages.scatter import SourceSpan
 from tilestream.store import StoreSettings, TileStore, open_store
-from tilestream.tiling import MM_PER_M, Box, TileKey
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ from typing import Any
 import pyproj
 import pyproj.exceptions
 
-from tilestream.config import IngestSettings
 from tilestream.errors import (
     CrsError,
     PartialError,
@@ -20,7 +19,7 @@ from tilestream.errors import (
 )
 from tilestream.formats import expand_sources, open_source
 from tilestream.formats.base import SourceInfo, Span
-from tilestream.formats.mcap import ScanSelection
+from tilestream.formats.logs.mcap import ScanSelection
 from tilestream.marks import hash_of
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.executor import Watch, execute
@@ -29,6 +28,7 @@ from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan
 from tilestream.pipeline.engine.stage import Task
 from tilestream.pipeline.stages.merge import merge, merge_tasks
 from tilestream.pipeline.stages.scatter import Fragment, SourceSpan, scatter, scatter_tasks
+from tilestream.settings import IngestSettings
 from tilestream.store import POINTS, StoreSettings, TileStore, open_store
 
 POINTS_PER_TASK = 4_000_000

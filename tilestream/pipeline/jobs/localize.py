@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from tilestream.config import RegistrationSettings, StartSettings
 from tilestream.errors import PartialError, TileNotReadyError, UsageError
-from tilestream.formats.mcap import ScanLog, ScanSelection
+from tilestream.formats.logs.mcap import ScanLog, ScanSelection
+from tilestream.grid import Box, TileKey, whole_mm
 from tilestream.kernels.fixed_order import norms
-from tilestream.localization import start_poses
+from tilestream.label import start_poses
 from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.outputs import Parquet
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, paths_of
@@ -23,9 +23,9 @@ from tilestream.pipeline.stages.label import label
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.register import MARGIN, Measuring, register
 from tilestream.records import Float64, TruePose
+from tilestream.settings import RegistrationSettings, StartSettings
 from tilestream.store import TileStore
 from tilestream.tables import read_tables, remove_others
-from tilestream.tiling import Box, TileKey, whole_mm
 
 SCANS_PER_TASK = 8
 """Scans of a slice: about a second of work with 317 starts."""

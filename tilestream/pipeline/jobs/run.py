@@ -26,8 +26,8 @@ import numpy as np
 import yaml
 
 from tilestream.errors import PartialError, UsageError
-from tilestream.forest.dataset import Dataset
-from tilestream.forest.model_file import load_model
+from tilestream.model.dataset import Dataset
+from tilestream.model.model_file import load_model
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.cluster import report_kept
 from tilestream.pipeline.engine.costs import learn

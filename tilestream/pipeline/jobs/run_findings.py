@@ -8,11 +8,12 @@ import numpy as np
 import pandas as pd
 
 from tilestream.errors import ModelError
-from tilestream.forest.dataset import TARGETS, Dataset
-from tilestream.forest.evaluation import ceiling, factor_sets, figures_by_protocol
-from tilestream.forest.intervals import coverage
-from tilestream.forest.models import FORESTS
-from tilestream.forest.training import MAIN, PREDICTION_COLUMNS
+from tilestream.grid import MM_PER_M, Box
+from tilestream.model.dataset import TARGETS, Dataset
+from tilestream.model.evaluation import ceiling, factor_sets, figures_by_protocol
+from tilestream.model.intervals import coverage
+from tilestream.model.models import FORESTS
+from tilestream.model.training import MAIN, PREDICTION_COLUMNS
 from tilestream.pipeline.engine.plan import paths_of
 from tilestream.pipeline.engine.stage import Task
 from tilestream.pipeline.jobs.run_settings import ModelSettings
@@ -22,7 +23,6 @@ from tilestream.records import Float64
 from tilestream.report.data import AROUND, Findings
 from tilestream.store import TileStore
 from tilestream.tables import read_tables, remove_others
-from tilestream.tiling import MM_PER_M, Box
 
 PLACE = ["route_id", "sample"]
 _NO_POINTS = pd.DataFrame(

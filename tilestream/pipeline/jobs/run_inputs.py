@@ -6,14 +6,13 @@ from glob import glob
 from pathlib import Path
 from typing import Any
 
-from tilestream.config import IngestSettings
 from tilestream.errors import ModelError, SourceNotFoundError, UsageError
 from tilestream.factors.virtual_scan import VirtualSettings
-from tilestream.forest.dataset import made_with
-from tilestream.forest.model_file import load_model
-from tilestream.forest.training import check_making
-from tilestream.formats.mcap import ScanSelection
+from tilestream.formats.logs.mcap import ScanSelection
 from tilestream.formats.routes import read_routes
+from tilestream.model.dataset import made_with
+from tilestream.model.model_file import load_model
+from tilestream.model.training import check_making
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.jobs.ingest import Reading, read_sources
 from tilestream.pipeline.jobs.run_settings import DriveSettings, RunSettings, SimulateSettings
@@ -22,6 +21,7 @@ from tilestream.pipeline.stages.drive_scans import Reading as DriveReading
 from tilestream.pipeline.stages.observe import Observing
 from tilestream.pipeline.stages.samples import COLUMNS
 from tilestream.records import Route
+from tilestream.settings import IngestSettings
 from tilestream.simulation.settings import SimulationSettings, load_preset
 from tilestream.store import open_store
 

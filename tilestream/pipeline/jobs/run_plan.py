@@ -6,11 +6,12 @@ from typing import Any
 from tilestream.factors import catalogue
 from tilestream.factors.rows import samples_by_tile
 from tilestream.factors.virtual_drive import NEIGHBOURS
-from tilestream.forest.dataset import TARGETS, features_of
-from tilestream.forest.evaluation import factor_sets
-from tilestream.forest.models import COMPETITORS, PHYSICS
-from tilestream.forest.training import MAIN
-from tilestream.formats.mcap import ScanSelection
+from tilestream.formats.logs.mcap import ScanSelection
+from tilestream.grid import MM_PER_M, TileGrid, TileKey
+from tilestream.model.dataset import TARGETS, features_of
+from tilestream.model.evaluation import factor_sets
+from tilestream.model.models import COMPETITORS, PHYSICS
+from tilestream.model.training import MAIN
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.outputs import Parquet
 from tilestream.pipeline.engine.plan import Plan
@@ -26,7 +27,6 @@ from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.predict import predict
 from tilestream.pipeline.stages.samples import COLUMNS, DatasetFile, samples
 from tilestream.pipeline.stages.train import ModelFile, ModelInUse, train
-from tilestream.tiling import MM_PER_M, TileGrid, TileKey
 
 OPPONENT = "training median"
 """Whom a part of the error is judged against: the others know no more of unseen paths."""

@@ -8,11 +8,11 @@ from typing import Annotated, Literal, Self
 import yaml
 from pydantic import Field, ValidationError, model_validator
 
-from tilestream.config import IngestSettings, RegistrationSettings, Settings, StartSettings
 from tilestream.errors import SourceNotFoundError, UsageError
 from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.records import TruePose
-from tilestream.sensors import SENSORS, Sensor
+from tilestream.sensor import SENSORS, Sensor
+from tilestream.settings import IngestSettings, RegistrationSettings, Settings, StartSettings
 
 Positive = Annotated[float, Field(gt=0.0)]
 Name = Annotated[str, Field(pattern=r"^[\w][\w .+-]*$")]

@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 
 from tilestream.errors import PartialError, PlanError, UsageError
-from tilestream.formats.rows import writing_whole
+from tilestream.formats.points.rows import writing_whole
 from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.engine.stage import Task

@@ -1,10 +1,10 @@
 """Cells: the NDT map of a tile."""
 
+from tilestream.grid import TileKey
 from tilestream.pipeline.engine.outputs import Made
 from tilestream.pipeline.engine.stage import stage
 from tilestream.pipeline.stages.map_part import MapPart
 from tilestream.store import CELLS_VERSION, cells_table
-from tilestream.tiling import TileKey
 
 FIXED_BYTES = 50_000_000
 """Memory of the task besides what it reads."""

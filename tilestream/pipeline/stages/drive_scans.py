@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from tilestream.errors import UsageError
-from tilestream.formats.deskew import Sweep, deskew
-from tilestream.formats.lesser import as_lesser
-from tilestream.formats.mcap import ScanLog, open_log
+from tilestream.formats.logs.degrade import as_lesser
+from tilestream.formats.logs.deskew import Sweep, deskew
+from tilestream.formats.logs.mcap import ScanLog, open_log
 from tilestream.marks import hash_of
 from tilestream.pipeline.engine.stage import Counts
 from tilestream.records import Scan

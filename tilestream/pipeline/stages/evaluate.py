@@ -3,9 +3,9 @@
 import pandas as pd
 
 from tilestream.errors import ModelError
-from tilestream.forest.dataset import Dataset
-from tilestream.forest.evaluation import factor_sets, judge
-from tilestream.forest.protocols import PROTOCOLS
+from tilestream.model.dataset import Dataset
+from tilestream.model.evaluation import factor_sets, judge
+from tilestream.model.protocols import PROTOCOLS
 from tilestream.pipeline.engine.outputs import Made, Stored
 from tilestream.pipeline.engine.stage import stage
 from tilestream.pipeline.stages.samples import BYTES_PER_ROW, DATASET_COLUMNS, FOREST_BYTES

@@ -9,14 +9,14 @@ from tilestream.factors.catalogue import COLUMNS, Which
 from tilestream.factors.rows import PLACE_COLUMNS, STATUS_COLUMNS, Samples, sample_rows
 from tilestream.factors.table import TermsCache
 from tilestream.factors.table import factors as factors_of
+from tilestream.grid import Box, TileKey, whole_mm
 from tilestream.marks import canonical
 from tilestream.pipeline.engine.outputs import Made, Parquet
 from tilestream.pipeline.engine.stage import Task, stage
 from tilestream.pipeline.stages.map_part import MapPart
 from tilestream.pipeline.stages.map_plan import MapPlan
-from tilestream.sensors import Sensor
+from tilestream.sensor import Sensor
 from tilestream.store import open_store
-from tilestream.tiling import Box, TileKey, whole_mm
 
 CACHE_BYTES = 300_000_000
 """Memory for the terms of the tiles in sight, kept for the tasks that follow."""

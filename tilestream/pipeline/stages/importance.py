@@ -3,9 +3,9 @@
 import pandas as pd
 
 from tilestream.errors import ModelError
-from tilestream.forest.dataset import Dataset
-from tilestream.forest.evaluation import criterion_importances, importances, importances_of
-from tilestream.forest.training import MAIN, Model
+from tilestream.model.dataset import Dataset
+from tilestream.model.evaluation import criterion_importances, importances, importances_of
+from tilestream.model.training import MAIN, Model
 from tilestream.pipeline.engine.outputs import Made
 from tilestream.pipeline.engine.stage import stage
 from tilestream.pipeline.stages.samples import BYTES_PER_ROW, FOREST_BYTES

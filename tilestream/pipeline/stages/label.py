@@ -5,7 +5,7 @@ from typing import Any
 
 import pandas as pd
 
-from tilestream.localization import summary
+from tilestream.label import summary
 from tilestream.pipeline.engine.outputs import Made, Stored
 from tilestream.pipeline.engine.stage import stage
 from tilestream.pipeline.stages.drive_scans import Sample

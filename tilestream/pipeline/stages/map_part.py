@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
+from tilestream.grid import TileKey
 from tilestream.pipeline.engine.stage import Counts
 from tilestream.store import POINTS, TileStore, open_store
-from tilestream.tiling import TileKey
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 from tilestream.factors.surfels import surfel_mm, surfels_table
 from tilestream.factors.terms import terms_table
+from tilestream.grid import Box, TileKey
 from tilestream.marks import hash_of
 from tilestream.pipeline.engine.outputs import TileArrays
 from tilestream.pipeline.engine.stage import Stage, Task
@@ -13,7 +14,6 @@ from tilestream.pipeline.stages.map_part import MapPart
 from tilestream.pipeline.stages.surfels import surfels
 from tilestream.pipeline.stages.terms import terms
 from tilestream.store import POINTS, TileStore, TileTable, cells_table
-from tilestream.tiling import Box, TileKey
 
 EXPECTED_DENSITY = 100
 """Points per square metre that a thinned tile is expected to keep, before it is merged: more than

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tilestream.errors import CorruptSourceError
+from tilestream.grid import MM_PER_M, TileGrid, TileKey, whole_mm
 from tilestream.kernels import thinning
 from tilestream.marks import hash_of
 from tilestream.pipeline.engine.outputs import Made, TileArrays
@@ -15,7 +16,6 @@ from tilestream.pipeline.engine.stage import BASE_BYTES, Counts, Task, stage
 from tilestream.pipeline.stages.scatter import Fragment, Int32, Print, add_prints, fragment_path
 from tilestream.records import Int64
 from tilestream.store import POINTS, TileStore, open_store
-from tilestream.tiling import MM_PER_M, TileGrid, TileKey, whole_mm
 
 BATCH_POINTS = 500_000
 """Points that are read at a time."""

@@ -8,9 +8,9 @@ import pandas as pd
 
 from tilestream.factors.rows import PLACE_COLUMNS
 from tilestream.factors.virtual_drive import physics
-from tilestream.forest.reasons import without_training
-from tilestream.forest.training import PREDICTION_COLUMNS, Model
-from tilestream.forest.training import predict as predicted
+from tilestream.model.reasons import without_training
+from tilestream.model.training import PREDICTION_COLUMNS, Model
+from tilestream.model.training import predict as predicted
 from tilestream.pipeline.engine.outputs import Stored
 from tilestream.pipeline.engine.stage import stage
 from tilestream.pipeline.stages.samples import BYTES_PER_ROW, places_with_factors

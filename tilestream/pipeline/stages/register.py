@@ -8,19 +8,19 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from tilestream.config import RegistrationSettings, StartSettings
 from tilestream.errors import PoseError, RegistrationError, UsageError
+from tilestream.grid import Box, TileKey
 from tilestream.kernels.fixed_order import norms
-from tilestream.localization import FINE_CELL, refined_pose, start_errors, start_poses
-from tilestream.localization import register as register_scan
+from tilestream.label import FINE_CELL, refined_pose, start_errors, start_poses
 from tilestream.marks import canonical
 from tilestream.pipeline.engine.outputs import Made
 from tilestream.pipeline.engine.stage import stage
 from tilestream.pipeline.stages.drive_scans import OpenedScans
 from tilestream.pipeline.stages.map_part import MapPart
 from tilestream.records import Cells, Column, Float64, Scan, TruePose
+from tilestream.registration import register as register_scan
+from tilestream.settings import RegistrationSettings, StartSettings
 from tilestream.store import open_store
-from tilestream.tiling import Box, TileKey
 
 MARGIN = 10.0
 """Map around what a scan sees: the way a start can go, and a cell [m]."""

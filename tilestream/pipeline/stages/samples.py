@@ -12,8 +12,8 @@ from tilestream.errors import SourceNotFoundError
 from tilestream.factors import catalogue, observability
 from tilestream.factors.rows import PLACE_COLUMNS
 from tilestream.factors.virtual_drive import averaged_along
-from tilestream.forest.dataset import Dataset, features_of, join
 from tilestream.marks import Mark
+from tilestream.model.dataset import Dataset, features_of, join
 from tilestream.pipeline.engine.outputs import Facts, Made, Stored
 from tilestream.pipeline.engine.stage import stage
 from tilestream.pipeline.stages.label import ERROR_COLUMNS

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from tilestream.errors import CorruptSourceError
 from tilestream.formats import open_source
 from tilestream.formats.base import Block, SourceInfo, Span
+from tilestream.grid import MAX_XY_MM, MAX_Z_MM, MM_PER_M, TileGrid, TileKey
 from tilestream.kernels import scatter as kernels
 from tilestream.marks import hash_of
 from tilestream.pipeline.engine.outputs import Facts, Made
@@ -22,7 +23,6 @@ from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.engine.stage import BASE_BYTES, Counts, Task, stage
 from tilestream.records import Int64
 from tilestream.store import TileStore, open_store
-from tilestream.tiling import MAX_XY_MM, MAX_Z_MM, MM_PER_M, TileGrid, TileKey
 
 Int32 = NDArray[np.int32]
 Print = tuple[int, int]

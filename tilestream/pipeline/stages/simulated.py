@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from tilestream.formats.las import write_las
-from tilestream.formats.mcap_write import write_log
-from tilestream.formats.rows import writing_whole
+from tilestream.formats.logs.mcap_write import write_log
+from tilestream.formats.points.las import write_las
+from tilestream.formats.points.rows import writing_whole
 from tilestream.marks import hash_of
 from tilestream.pipeline.engine.outputs import Facts, Made
 from tilestream.pipeline.engine.stage import Counts, stage

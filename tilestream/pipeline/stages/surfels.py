@@ -1,10 +1,10 @@
 """Surfels: what a virtual scan sees of a tile instead of points."""
 
 from tilestream.factors.surfels import SURFELS_VERSION, surfels_table
+from tilestream.grid import TileKey
 from tilestream.pipeline.engine.outputs import Made
 from tilestream.pipeline.engine.stage import stage
 from tilestream.pipeline.stages.map_part import MapPart
-from tilestream.tiling import TileKey
 
 FIXED_BYTES = 100_000_000
 """Memory of the task besides what it reads: the planes of some voxels."""

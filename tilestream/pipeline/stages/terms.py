@@ -1,10 +1,10 @@
 """Terms: all of a tile's cells that does not depend on the sample point."""
 
 from tilestream.factors.terms import TERMS_VERSION, terms_table
+from tilestream.grid import TileKey
 from tilestream.pipeline.engine.outputs import Made
 from tilestream.pipeline.engine.stage import stage
 from tilestream.pipeline.stages.map_part import MapPart
-from tilestream.tiling import TileKey
 
 FIXED_BYTES = 150_000_000
 """Memory of the task besides what it reads: the neighbours of some cells, their pairs."""

@@ -7,10 +7,10 @@ from functools import lru_cache
 from pathlib import Path
 
 from tilestream.errors import ModelError, SourceNotFoundError
-from tilestream.forest.dataset import Dataset
-from tilestream.forest.model_file import load_model, save_model
-from tilestream.forest.training import Model
-from tilestream.forest.training import train as trained
+from tilestream.model.dataset import Dataset
+from tilestream.model.model_file import load_model, save_model
+from tilestream.model.training import Model
+from tilestream.model.training import train as trained
 from tilestream.pipeline.engine.outputs import Facts, Made
 from tilestream.pipeline.engine.stage import Counts, stage
 from tilestream.pipeline.stages.samples import BYTES_PER_ROW, FOREST_BYTES

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tilestream.errors import CorruptSourceError, PoseError, SourceError, UsageError
-from tilestream.formats import ros2
 from tilestream.formats.base import Block, SourceInfo, Span
-from tilestream.formats.log_poses import POSE_TYPES, PoseTrack, choose_poses
-from tilestream.formats.mcap_file import McapFile, Message, Topic
-from tilestream.formats.poses import PoseStatus, interpolate, transform
+from tilestream.formats.logs import ros2
+from tilestream.formats.logs.log_poses import POSE_TYPES, PoseTrack, choose_poses
+from tilestream.formats.logs.mcap_file import McapFile, Message, Topic
+from tilestream.formats.logs.poses import PoseStatus, interpolate, transform
 from tilestream.kernels.fixed_order import norms
 from tilestream.records import Float64, Int64, Scan, Trajectory
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tilestream.errors import PoseError, UsageError
-from tilestream.formats.poses import PoseStatus, interpolate
+from tilestream.formats.logs.poses import PoseStatus, interpolate
 from tilestream.kernels.fixed_order import turned
 from tilestream.records import Float64, Scan, Trajectory
 

@@ -20,11 +20,11 @@ import skops.io
 from sklearn.ensemble import RandomForestRegressor
 
 from tilestream.errors import ModelError, SourceNotFoundError
-from tilestream.forest.domain import Domain
-from tilestream.forest.intervals import Interval
-from tilestream.forest.models import Forest
-from tilestream.forest.reasons import Typical
-from tilestream.forest.training import Model
+from tilestream.model.domain import Domain
+from tilestream.model.intervals import Interval
+from tilestream.model.models import Forest
+from tilestream.model.reasons import Typical
+from tilestream.model.training import Model
 from tilestream.version import VERSION
 
 FORMAT = "tilestream model"

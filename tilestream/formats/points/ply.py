@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from tilestream.errors import CorruptSourceError, UnknownFormatError, UsageError
 from tilestream.formats.base import Block, SourceInfo, Span
-from tilestream.formats.rows import (
+from tilestream.formats.points.rows import (
     BinaryRows,
     Column,
     Columns,

@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tilestream.errors import CorruptSourceError, UsageError
 from tilestream.formats.base import Block, SourceInfo, Span
-from tilestream.formats.projector import crs_beside
-from tilestream.formats.rows import (
+from tilestream.formats.points.rows import (
     BinaryRows,
     Column,
     Columns,
@@ -27,6 +26,7 @@ from tilestream.formats.rows import (
     whole_span,
     writing_whole,
 )
+from tilestream.formats.projector import crs_beside
 from tilestream.kernels import lzf
 
 _KEYWORDS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.stats import rankdata
 from sklearn.ensemble import RandomForestRegressor
 
-from tilestream.forest.phrases import (
+from tilestream.model.phrases import (
     ACROSS,
     ALONG,
     REASSURING,

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tilestream.errors import UsageError
-from tilestream.tiling import Box, TileGrid, TileKey, whole_mm
+from tilestream.grid import Box, TileGrid, TileKey, whole_mm
 
 keys = st.builds(TileKey, st.integers(-(10**6), 10**6), st.integers(-(10**6), 10**6))
 grids = st.builds(TileGrid, st.integers(1, 10**6), st.integers(0, 10**5))

@@ -8,9 +8,9 @@ import pandas as pd
 from scipy.stats import spearmanr
 
 from tilestream.errors import ModelError
-from tilestream.forest.dataset import Dataset
-from tilestream.forest.models import COMPETITORS, PAPER, Forest, Recipe, grow
-from tilestream.forest.protocols import PROTOCOLS, Split, block_splits
+from tilestream.model.dataset import Dataset
+from tilestream.model.models import COMPETITORS, PAPER, Forest, Recipe, grow
+from tilestream.model.protocols import PROTOCOLS, Split, block_splits
 from tilestream.records import Column, Float64
 
 CRITERIA = ("FS", "RQ", "LY", "LS")

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from tilestream.errors import PoseError
-from tilestream.formats import ros2
-from tilestream.formats.poses import Edge, compose, trajectory
+from tilestream.formats.logs import ros2
+from tilestream.formats.logs.poses import Edge, compose, trajectory
 from tilestream.records import Float64, Int64, Trajectory
 
 POSE_TYPES = (ros2.ODOMETRY, ros2.POSE, ros2.POSE_COVARIANCE)

@@ -6,7 +6,7 @@ import pytest
 from forest_data import COLUMNS, WEAK_AXIS, dataset, drives
 
 from tilestream.errors import ModelError, UsageError
-from tilestream.forest.dataset import (
+from tilestream.model.dataset import (
     PLACE,
     TARGETS,
     Dataset,
@@ -15,10 +15,10 @@ from tilestream.forest.dataset import (
     made_with,
     with_derived,
 )
-from tilestream.forest.evaluation import factor_sets
-from tilestream.forest.protocols import PROTOCOLS, block_splits, leave_path_out, random_split
+from tilestream.model.evaluation import factor_sets
+from tilestream.model.protocols import PROTOCOLS, block_splits, leave_path_out, random_split
 from tilestream.records import Column
-from tilestream.sensors import VLP16
+from tilestream.sensor import VLP16
 
 SHORT = {"a": 260, "b": 410, "c": 90}
 

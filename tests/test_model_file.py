@@ -19,13 +19,13 @@ from scipy.stats import spearmanr
 from sklearn.linear_model import LinearRegression
 
 from tilestream.errors import ModelError, SourceNotFoundError, UsageError
-from tilestream.forest import model_file, training
-from tilestream.forest.dataset import TARGETS, Dataset, features_of, join, made_with
-from tilestream.forest.domain import domain_of
-from tilestream.forest.model_file import load_model, save_model
-from tilestream.forest.models import Recipe, grow
-from tilestream.forest.phrases import PHRASES, REASSURING, phrase_of
-from tilestream.forest.reasons import (
+from tilestream.model import model_file, training
+from tilestream.model.dataset import TARGETS, Dataset, features_of, join, made_with
+from tilestream.model.domain import domain_of
+from tilestream.model.model_file import load_model, save_model
+from tilestream.model.models import Recipe, grow
+from tilestream.model.phrases import PHRASES, REASSURING, phrase_of
+from tilestream.model.reasons import (
     SHARES,
     UNITS,
     Typical,
@@ -34,11 +34,11 @@ from tilestream.forest.reasons import (
     in_words,
     typical_of,
 )
-from tilestream.forest.training import PREDICTION_COLUMNS, Model, predict, train
+from tilestream.model.training import PREDICTION_COLUMNS, Model, predict, train
 from tilestream.pipeline.stages.predict import physical
 from tilestream.pipeline.stages.samples import COLUMNS as COLUMNS_LEARNT
 from tilestream.records import Column
-from tilestream.sensors import HDL64, VLP16
+from tilestream.sensor import HDL64, VLP16
 
 MADE_WITH = made_with(COLUMNS, VLP16, 2.0)
 NAMES = [column.name for column in COLUMNS]

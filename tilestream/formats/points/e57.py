@@ -18,7 +18,7 @@ from pyproj.exceptions import CRSError
 
 from tilestream.errors import CorruptSourceError
 from tilestream.formats.base import Block, SourceInfo, Span
-from tilestream.formats.rows import finite_block, whole_span
+from tilestream.formats.points.rows import finite_block, whole_span
 from tilestream.kernels.fixed_order import turned
 from tilestream.records import Float64
 

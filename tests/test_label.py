@@ -10,17 +10,12 @@ from literal_registration import Floats, expm
 from scenes import UTM, scene
 from test_registration import T_MAP_LIDAR, scan_of
 
-from tilestream.config import RegistrationSettings, StartSettings
 from tilestream.errors import RegistrationError, UsageError
-from tilestream.localization import (
-    disc_starts,
-    localization_error,
-    refined_pose,
-    register,
-    start_poses,
-)
+from tilestream.label import disc_starts, localization_error, refined_pose, start_poses
 from tilestream.ndt import cells_of
 from tilestream.records import Cells, LocalizationError
+from tilestream.registration import register
+from tilestream.settings import RegistrationSettings, StartSettings
 
 
 @pytest.fixture(scope="module")

@@ -19,9 +19,9 @@ from tilestream.errors import (
     UnknownFormatError,
     UsageError,
 )
-from tilestream.formats.lanelet2 import read_lanelet2
-from tilestream.formats.mcap import open_log
-from tilestream.formats.route_files import Path3, read_csv, read_geojson, read_poses
+from tilestream.formats.logs.mcap import open_log
+from tilestream.formats.routes.files import Path3, read_csv, read_geojson, read_poses
+from tilestream.formats.routes.lanelet2 import read_lanelet2
 from tilestream.kernels.fixed_order import norms
 from tilestream.records import Float64, Route, Trajectory
 

@@ -5,7 +5,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from tilestream.config import Settings
+from tilestream.settings import Settings
 
 
 class Sensor(Settings):

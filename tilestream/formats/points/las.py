@@ -19,7 +19,7 @@ from pyproj.exceptions import CRSError
 
 from tilestream.errors import CorruptSourceError, CrsError, UsageError
 from tilestream.formats.base import Block, SourceInfo, Span
-from tilestream.formats.rows import (
+from tilestream.formats.points.rows import (
     BinaryRows,
     Column,
     Scaling,

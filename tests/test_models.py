@@ -13,9 +13,9 @@ from sklearn.ensemble import RandomForestRegressor
 
 from tilestream.errors import ModelError
 from tilestream.factors import layout
-from tilestream.forest import evaluation
-from tilestream.forest.dataset import Dataset, join, with_derived
-from tilestream.forest.evaluation import (
+from tilestream.model import evaluation
+from tilestream.model.dataset import Dataset, join, with_derived
+from tilestream.model.evaluation import (
     PAPER_TABLE,
     Figures,
     ceiling,
@@ -28,8 +28,8 @@ from tilestream.forest.evaluation import (
     importances,
     judge,
 )
-from tilestream.forest.intervals import calibrate, coverage
-from tilestream.forest.models import (
+from tilestream.model.intervals import calibrate, coverage
+from tilestream.model.models import (
     CANDIDATES,
     CAUTIOUS,
     COMPETITORS,
@@ -40,7 +40,7 @@ from tilestream.forest.models import (
     telling,
     tuned,
 )
-from tilestream.forest.protocols import Split, block_splits, leave_path_out, random_split
+from tilestream.model.protocols import Split, block_splits, leave_path_out, random_split
 from tilestream.records import Column
 
 THREE = {"a": 420, "b": 420, "c": 420}

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from tilestream.errors import ModelError, UsageError
 from tilestream.records import Column, Float64, Int64
-from tilestream.sensors import Sensor
+from tilestream.sensor import Sensor
 
 TARGETS = (
     "error_mean",

@@ -18,8 +18,8 @@ from sklearn.svm import SVR
 from threadpoolctl import threadpool_limits
 
 from tilestream.errors import ModelError
-from tilestream.forest.dataset import Dataset
-from tilestream.forest.protocols import Split, block_splits
+from tilestream.model.dataset import Dataset
+from tilestream.model.protocols import Split, block_splits
 from tilestream.records import Float64
 
 LENGTHS = ("error_mean", "error_floor", "along_mean", "across_mean", "up_mean")

@@ -10,9 +10,9 @@ from typing import Any
 
 from tilestream.errors import CorruptSourceError, SourceNotFoundError, UnknownFormatError
 from tilestream.formats.base import Block, SourceInfo, Span
-from tilestream.formats.pcd import PcdSource, open_pcd
+from tilestream.formats.points.pcd import PcdSource, open_pcd
+from tilestream.formats.points.rows import whole_span
 from tilestream.formats.projector import METADATA, PROJECTOR, read_projector, read_yaml
-from tilestream.formats.rows import whole_span
 
 _INSIDE = "pointcloud_map.pcd"
 """The sub-directory into which Autoware puts the PCD files."""

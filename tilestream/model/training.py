@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from tilestream.errors import ModelError, UsageError
-from tilestream.forest.dataset import TARGETS, Dataset, with_derived
-from tilestream.forest.domain import Domain, domain_of
-from tilestream.forest.intervals import LEVEL, NOT_CALIBRATED, Interval, calibrate
-from tilestream.forest.models import PAPER, Forest, Recipe, grow, telling, tuned
-from tilestream.forest.protocols import block_splits
-from tilestream.forest.reasons import (
+from tilestream.model.dataset import TARGETS, Dataset, with_derived
+from tilestream.model.domain import Domain, domain_of
+from tilestream.model.intervals import LEVEL, NOT_CALIBRATED, Interval, calibrate
+from tilestream.model.models import PAPER, Forest, Recipe, grow, telling, tuned
+from tilestream.model.protocols import block_splits
+from tilestream.model.reasons import (
     PIECE,
     Typical,
     compared,

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from tilestream.errors import ModelError
-from tilestream.forest.dataset import Dataset
+from tilestream.model.dataset import Dataset
 from tilestream.records import Int64
 
 BUFFER = 100.0

@@ -1,0 +1,1 @@
+"""Logs of drives: scans, poses and frames."""
