@@ -54,7 +54,7 @@ def watched(tasks: list[dict[str, Any]]) -> Any:
 def street(spacing: float, seed: int) -> np.ndarray:
     """A canyon within one tile, about 1,900 / spacing^2 points [m]."""
     points = PLACES["canyon"](np.random.default_rng(seed), LENGTH, spacing)
-    return points + [10.0, 50.0, 0.0]
+    return points + np.array([10.0, 50.0, 0.0])
 
 
 def write_drive(path: Path) -> Path:

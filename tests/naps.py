@@ -47,9 +47,21 @@ class After:
 
 
 def napping(
-    after: object, key: str, seconds: float, later: float, failures: int, how: str, notes: str
+    after: object,
+    key: str,
+    seconds: float,
+    later: float,
+    failures: int,
+    how: str,
+    notes: str,
+    gate: str,
 ) -> str:
-    """Sleep, note the try, fail the first `failures` times as told, sleep again."""
+    """Sleep, note the try, fail the first `failures` times as told, sleep again.
+
+    A gate is a file that is waited for first.
+    """
+    while gate and not Path(gate).exists():
+        time.sleep(0.02)
     if seconds:
         time.sleep(seconds)
     if notes:
@@ -136,9 +148,11 @@ def Nap(
     how: str = "",
     notes: str = "",
     work: int = 1,
+    gate: str = "",
 ) -> Task:
     """A task of a stage, for a tile."""
     what = {"seconds": seconds, "later": after, "failures": failures, "how": how, "notes": notes}
+    what["gate"] = gate
     return Task(
         NAPS[stage],
         str(tile),

@@ -1,4 +1,4 @@
-"""What a client tells the scheduler of a run, so that its dashboard can show it."""
+"""What a client sends to the scheduler about a run, so that its dashboard can show it."""
 
 import logging
 import time
@@ -13,9 +13,9 @@ from tilestream.pipeline.engine.stage import Task
 logger = logging.getLogger(__name__)
 
 TASKS_PER_MESSAGE = 500
-"""How many tasks or outcomes a client tells at a time."""
-TELL_EVERY = 0.5
-"""How often a client tells outcomes [s]."""
+"""Most tasks or outcomes in a message."""
+SEND_EVERY = 0.5
+"""How often outcomes are sent [s]."""
 
 
 def page_url(client: Any | None) -> str | None:
@@ -25,8 +25,8 @@ def page_url(client: Any | None) -> str | None:
 
 
 @contextmanager
-def telling(client: Any, named: Callable[[str], str]) -> Iterator["DashboardClient"]:
-    """Tell the scheduler of a run, for its page: tasks as they are planned, outcomes as they come.
+def dashboard_client(client: Any, named: Callable[[str], str]) -> Iterator["DashboardClient"]:
+    """Sends a run to the scheduler, for its page: planned tasks, then their outcomes.
 
     Nothing that goes wrong here disturbs the run: the page is a view, the store is the truth.
 
@@ -35,25 +35,25 @@ def telling(client: Any, named: Callable[[str], str]) -> Iterator["DashboardClie
         named: the Dask key of a task, from its own.
 
     Yields:
-        What is to be told of tasks and outcomes.
+        What takes tasks and outcomes.
     """
     page = DashboardClient(client, named)
     try:
         yield page
     finally:
-        page.tell("end")
+        page.send("end")
 
 
 class DashboardClient:
-    """Tells outcomes some at a time."""
+    """Sends tasks and outcomes in messages of bounded size."""
 
     def __init__(self, client: Any, named: Callable[[str], str]) -> None:
         self._client = client
         self._named = named
         self._outcomes: list[list[Any]] = []
-        self._told = time.monotonic()
+        self._sent = time.monotonic()
         try:
-            # Bokeh is heavy, and most processes that import this one have no scheduler to tell.
+            # Bokeh is heavy, and most processes that import this one have no scheduler.
             from tilestream.pipeline.engine.dashboard import ProgressPlugin  # noqa: PLC0415
 
             client.register_plugin(ProgressPlugin())
@@ -63,7 +63,7 @@ class DashboardClient:
             self._open = False
 
     def plan(self, tasks: Sequence[Task]) -> None:
-        """Tell the tasks, in messages of bounded size."""
+        """Send the tasks of a plan."""
         for first in range(0, len(tasks), TASKS_PER_MESSAGE):
             part = tasks[first : first + TASKS_PER_MESSAGE]
             stages: dict[str, int] = {}
@@ -82,19 +82,19 @@ class DashboardClient:
             self._send({"op": "plan", "stages": [list(s) for s in stages.items()], "tasks": lines})
 
     def learn(self, outcome: Outcome) -> None:
-        """Note an outcome; tell what has gathered every now and then."""
+        """Take an outcome; every now and then, send what has gathered."""
         status = DONE if outcome.ok else REFUSED if outcome.refused else FAILED
         name = outcome.key if status == FAILED else ""
         reason = outcome.reason[:LONGEST_REASON] if status == FAILED else ""
         self._outcomes.append([self._named(outcome.key), status, name, reason])
         full = len(self._outcomes) >= TASKS_PER_MESSAGE
-        if full or time.monotonic() - self._told > TELL_EVERY:
-            self.tell("outcomes")
+        if full or time.monotonic() - self._sent > SEND_EVERY:
+            self.send("outcomes")
 
-    def tell(self, op: str) -> None:
-        """Tell what has gathered."""
+    def send(self, op: str) -> None:
+        """Send what has gathered."""
         self._send({"op": op, "outcomes": self._outcomes})
-        self._outcomes, self._told = [], time.monotonic()
+        self._outcomes, self._sent = [], time.monotonic()
 
     def _send(self, message: dict[str, Any]) -> None:
         if not self._open or self._client.status != "running":
@@ -102,4 +102,4 @@ class DashboardClient:
         try:
             self._client.log_event(NAME, {**message, "client": self._client.id})
         except Exception as error:  # noqa: BLE001 - the run itself sees a lost scheduler
-            logger.debug("not told: %s", error or repr(error))
+            logger.debug("not sent: %s", error or repr(error))

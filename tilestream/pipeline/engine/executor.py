@@ -7,7 +7,7 @@ from typing import Any
 
 from tilestream.pipeline.engine.attempt import Outcome, attempt
 from tilestream.pipeline.engine.dask_executor import DaskNames, run_on_dask
-from tilestream.pipeline.engine.events import telling
+from tilestream.pipeline.engine.events import dashboard_client
 from tilestream.pipeline.engine.frontier import RETRIES, Frontier
 from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.engine.stage import Task
@@ -62,7 +62,7 @@ def execute(
             running, page = _run_here(frontier, plan.memory), None
         else:
             running = run_on_dask(frontier, client, names, plan.memory, patience)
-            page = stack.enter_context(telling(client, names))
+            page = stack.enter_context(dashboard_client(client, names))
 
         def add(tasks: Iterable[Task]) -> None:
             more = list(tasks)
