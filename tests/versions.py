@@ -219,7 +219,9 @@ def golden(folder: Path) -> dict[str, Any]:
 
     executor.attempt = noted
     streets.write_inputs(folder)
-    ts.simulate("shinjuku", folder / "city", paths=("III",), size="small")
+    settings = importlib.import_module("tilestream.simulation.settings").load_preset("physical")
+    simulating = importlib.import_module("tilestream.pipeline.jobs.simulate")
+    simulating.simulate(settings, folder / "city", paths=("III",), size="small")
     observing = {"range_max": streets.REACH, "starts": 8}
     starts = {"radius": 0.6, "step": 0.2}
     label = {"matcher": "autoware", "starts": starts, "true_pose": "refined"}
