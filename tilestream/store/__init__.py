@@ -12,30 +12,31 @@ facts). Without a mark a table is missing, whatever lies there; every reader loo
 """
 
 import html
-import json
-from collections.abc import Callable, Container, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
-import fsspec
 import numpy as np
-import zarr
 from numpy.typing import NDArray
-from zarr.codecs import BloscCodec
 
-from tilestream.errors import (
-    StoreError,
-    StoreNotFoundError,
-    StoreVersionError,
-    TileNotReadyError,
-    UsageError,
-)
+from tilestream.errors import StoreError, StoreVersionError, TileNotReadyError, UsageError
 from tilestream.grid import MM_PER_M, Box, TileGrid, TileKey, whole_mm
-from tilestream.marks import MISSING, Mark, hash_of, identity_of
+from tilestream.marks import Mark
 from tilestream.ndt import cells_of_mm
 from tilestream.records import Cells, Float64, Int64
+from tilestream.store.arrays import (
+    Files,
+    create_root,
+    erase,
+    read_columns,
+    read_marks,
+    read_root,
+    write_columns,
+    write_root,
+)
+from tilestream.store.table import TileTable as TileTable
 from tilestream.version import VERSION
 
 SCHEMA = 2
@@ -44,55 +45,6 @@ POINTS = "points"
 """Name of the table that ingest writes: the column `xyz`."""
 CELLS_VERSION = 1
 """Raise it when the cells that are made from the same points change."""
-_CODEC = BloscCodec(cname="zstd", clevel=3, shuffle="bitshuffle")
-_OURS = "tilestream"
-
-
-@dataclass(frozen=True)
-class TileTable:
-    """A table that every tile can have, made from the map within reach of the tile."""
-
-    name: str
-    """Name of the table in a tile, e.g. `cells_2000`."""
-    stage: str
-    """Name of the stage that makes it."""
-    version: int
-    """Version of that stage."""
-    takes: Mapping[str, Any]
-    """The settings of the stage."""
-    reach_mm: int
-    """How far around the tile the map decides the table [mm]."""
-    make: Callable[["TileStore", TileKey], dict[str, NDArray[Any]]]
-    """Makes the columns."""
-    reads: "TileTable | None" = None
-    """The table of the tiles in reach that it is made from; None: their points."""
-
-    @property
-    def points_reach_mm(self) -> int:
-        """How far around the tile points decide it, through all that it is made from [mm]."""
-        return self.reach_mm + (0 if self.reads is None else self.reads.points_reach_mm)
-
-    def tiles(self, grid: TileGrid, key: TileKey, have: Container[TileKey]) -> list[TileKey]:
-        """The tiles in reach of one that the map has, sorted."""
-        near = grid.keys_over(grid.core(key).grown(self.reach_mm))
-        return [k for k in near if k in have]
-
-    def identity(self, grid: TileGrid, key: TileKey, have: Mapping[TileKey, str]) -> str:
-        """The identity that the table of a tile has, or will have.
-
-        Args:
-            grid: the tiles.
-            key: the tile.
-            have: the identity of the points of each tile of the map, at least of those in reach.
-        """
-        near = self.tiles(grid, key, have)
-        below = self.reads
-        if below is None:
-            inputs = [(str(k), have[k]) for k in near]
-        else:
-            inputs = [(str(k), below.identity(grid, k, have)) for k in near]
-        takes = {**self.takes, "tile": key}
-        return identity_of(self.stage, self.version, takes, {"map_part": [hash_of(inputs)]})
 
 
 @dataclass(frozen=True)
@@ -200,24 +152,7 @@ class Tile:
             StoreError: a column of a done table was lost or damaged since.
         """
         columns: list[str] = self.require(table).facts["columns"]
-        found = {}
-        for name in columns:
-            path = f"{self.key}/{table}/{name}"
-            try:
-                column = np.asarray(zarr.open_array(self.store._zarr, path=path, mode="r")[...])
-            except (FileNotFoundError, KeyError, ValueError, RuntimeError) as error:
-                raise StoreError(
-                    f"{self.store.url}/{path} cannot be read ({error}): "
-                    f"delete the folder {self.key}/{table} and run the same command again"
-                ) from error
-            chunk = "/".join(["c", *("0" for _ in column.shape)])  # of a lost one, zeros are read
-            if column.size and not self.store.fs.exists(f"{self.store.root}/{path}/{chunk}"):
-                raise StoreError(
-                    f"{self.store.url}/{path} has lost a chunk: "
-                    f"delete the folder {self.key}/{table} and run the same command again"
-                )
-            found[name] = column
-        return found
+        return read_columns(self.store.files, f"{self.key}/{table}", columns)
 
     def write_table(self, table: str, columns: Mapping[str, NDArray[Any]], mark: Mark) -> None:
         """Replace a table: the old mark goes first, the new one comes last.
@@ -227,37 +162,13 @@ class Tile:
             columns: an array per column, each written as one chunk.
             mark: of status `done`; the names of the columns are added to its facts.
         """
-        self._erase(table)
-        for name, column in columns.items():
-            array = zarr.create_array(
-                self.store._zarr,
-                name=f"{self.key}/{table}/{name}",
-                shape=column.shape,
-                chunks=tuple(max(1, n) for n in column.shape),
-                dtype=column.dtype,
-                compressors=_CODEC,
-                config={"write_empty_chunks": True},
-            )
-            array[...] = column
-        self._write_mark(table, mark, columns=list(columns))
+        erase(self.store.files, f"{self.key}/{table}")
+        write_columns(self.store.files, f"{self.key}/{table}", columns, mark)
 
     def write_reason(self, table: str, mark: Mark) -> None:
         """Replace a table by the reason why there is none (`failed` or `skipped`)."""
-        self._erase(table)
-        self._write_mark(table, mark, columns=[])
-
-    def _write_mark(self, table: str, mark: Mark, columns: list[str]) -> None:
-        known = asdict(mark)
-        known["facts"] = {**mark.facts, "columns": columns}
-        zarr.open_group(self.store._zarr, path=f"{self.key}/{table}", mode="a").attrs[_OURS] = known
-
-    def _erase(self, table: str) -> None:
-        folder = f"{self.store.root}/{self.key}/{table}"
-        fs = self.store.fs
-        if fs.exists(folder):
-            if fs.exists(f"{folder}/zarr.json"):
-                fs.rm(f"{folder}/zarr.json")
-            fs.rm(folder, recursive=True)
+        erase(self.store.files, f"{self.key}/{table}")
+        write_columns(self.store.files, f"{self.key}/{table}", {}, mark)
 
 
 class TileStore:
@@ -274,29 +185,24 @@ class TileStore:
         self.grid = TileGrid.of(settings.tile_size, settings.halo)
 
     @cached_property
-    def _place(self) -> tuple[Any, str]:
-        fs, root = fsspec.core.url_to_fs(self.url)
-        fs.use_listings_cache = False
-        return fs, str(root).rstrip("/")
+    def files(self) -> Files:
+        """Where it lies."""
+        return Files.at(self.url)
 
     @property
     def fs(self) -> Any:
         """The fsspec filesystem that the store is on."""
-        return self._place[0]
+        return self.files.fs
 
     @property
     def root(self) -> str:
         """The store's path on that filesystem."""
-        return self._place[1]
+        return self.files.root
 
     @property
     def address(self) -> str:
         """The store's URL; of a local store its absolute path, for readers started elsewhere."""
         return self.url if "://" in self.url else str(Path(self.url).absolute())
-
-    @cached_property
-    def _zarr(self) -> Any:
-        return zarr.open_group(self.url, mode="r+").store
 
     def __getstate__(self) -> dict[str, Any]:
         return {"url": self.url, "settings": self.settings, "grid": self.grid}
@@ -314,7 +220,7 @@ class TileStore:
             store.grid.require_cell_size(whole_mm(settings.map_leaf, "map_leaf"))
         if store.fs.exists(store.root) and store.fs.ls(store.root, detail=False):
             raise StoreError(f"{url} is there and is no tile store: choose another path")
-        zarr.open_group(url, mode="w", attributes={_OURS: store._attributes([], {})})
+        create_root(store.url, store._attributes([], {}))
         return store
 
     def _attributes(
@@ -333,12 +239,12 @@ class TileStore:
 
         Empty until an ingest has ended.
         """
-        found: list[dict[str, Any]] = _root_attributes(self.fs, self.root, self.url)["sources"]
+        found: list[dict[str, Any]] = _known(self.files)["sources"]
         return found
 
     def made_by(self) -> dict[str, int]:
         """The stages that made the map, with their versions; empty until an ingest has ended."""
-        found: dict[str, int] = _root_attributes(self.fs, self.root, self.url)["made_by"]
+        found: dict[str, int] = _known(self.files)["made_by"]
         return found
 
     def write_sources(self, sources: list[dict[str, Any]], made_by: Mapping[str, int]) -> None:
@@ -346,11 +252,11 @@ class TileStore:
 
         The one writer is the process that ran the ingest.
         """
-        zarr.open_group(self._zarr, mode="r+").attrs[_OURS] = self._attributes(sources, made_by)
+        write_root(self.files, self._attributes(sources, made_by))
 
     def remove(self, key: TileKey) -> None:
         """Remove a tile with all its tables; the mark of its points goes first."""
-        Tile(self, key)._erase(POINTS)
+        erase(self.files, f"{key}/{POINTS}")
         self.fs.rm(f"{self.root}/{key}", recursive=True)
 
     def remove_fragments(self) -> None:
@@ -382,12 +288,7 @@ class TileStore:
                 continue
 
     def _marks(self, wanted: list[tuple[TileKey, str]]) -> list[Mark]:
-        paths = [f"{self.root}/{key}/{table}/zarr.json" for key, table in wanted]
-        if not paths:
-            return []
-        texts = self.fs.cat(paths, on_error="omit")
-        by_end = {"/".join(str(path).split("/")[-3:]): text for path, text in texts.items()}
-        return [_parse_mark(by_end.get(f"{key}/{table}/zarr.json")) for key, table in wanted]
+        return read_marks(self.files, [f"{key}/{table}" for key, table in wanted])
 
     def tile(self, key: tuple[int, int]) -> Tile:
         """The tile of a key `(ix, iy)`.
@@ -496,38 +397,18 @@ def open_store(url: str) -> TileStore:
         StoreError: something else lies there.
         UsageError: a file lies there, or where a folder above it would be.
     """
-    fs, root = fsspec.core.url_to_fs(str(url))
-    attributes = _root_attributes(fs, str(root).rstrip("/"), str(url))
+    attributes = _known(Files.at(str(url)))
     return TileStore(str(url), StoreSettings(**attributes["settings"]))
 
 
-def _root_attributes(fs: Any, root: str, url: str) -> dict[str, Any]:
-    try:
-        text = fs.cat_file(f"{root}/zarr.json")
-    except FileNotFoundError:
-        raise StoreNotFoundError(
-            f"no tile store at {url}: make one with `tilestream ingest SOURCES --store {url}`"
-        ) from None
-    except NotADirectoryError:
-        raise UsageError(
-            f"{url} is a file, or below one, and a tile store is a folder: name another path"
-        ) from None
-    try:
-        attributes: dict[str, Any] = json.loads(text)["attributes"][_OURS]
-        schema = int(attributes["schema"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise StoreError(f"{url} is a Zarr group but no tile store of tilestream") from error
+def _known(files: Files) -> dict[str, Any]:
+    """What a store says of itself; errors as of `open_store`."""
+    attributes = read_root(files)
+    schema = int(attributes["schema"])
     if schema != SCHEMA:
         what = "install the newer tilestream" if schema > SCHEMA else "give another path"
         raise StoreVersionError(
-            f"{url} has schema {schema}, this is tilestream {VERSION} with schema {SCHEMA}: "
+            f"{files.url} has schema {schema}, this is tilestream {VERSION} with schema {SCHEMA}: "
             f"{what}, or remove it and ingest the sources again"
         )
     return attributes
-
-
-def _parse_mark(text: bytes | None) -> Mark:
-    if text is None:
-        return MISSING
-    known = json.loads(text).get("attributes", {}).get(_OURS)
-    return Mark(**known) if known else MISSING

@@ -1,0 +1,57 @@
+"""A table that is made from the map, tile by tile: by which stage, from what, how far around."""
+
+from collections.abc import Callable, Container, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from numpy.typing import NDArray
+
+from tilestream.grid import TileGrid, TileKey
+from tilestream.marks import hash_of, identity_of
+
+
+@dataclass(frozen=True)
+class TileTable:
+    """A table that every tile can have, made from the map within reach of the tile."""
+
+    name: str
+    """Name of the table in a tile, e.g. `cells_2000`."""
+    stage: str
+    """Name of the stage that makes it."""
+    version: int
+    """Version of that stage."""
+    takes: Mapping[str, Any]
+    """The settings of the stage."""
+    reach_mm: int
+    """How far around the tile the map decides the table [mm]."""
+    make: Callable[[Any, TileKey], dict[str, NDArray[Any]]]
+    """Makes the columns, from the store and the tile."""
+    reads: "TileTable | None" = None
+    """The table of the tiles in reach that it is made from; None: their points."""
+
+    @property
+    def points_reach_mm(self) -> int:
+        """How far around the tile points decide it, through all that it is made from [mm]."""
+        return self.reach_mm + (0 if self.reads is None else self.reads.points_reach_mm)
+
+    def tiles(self, grid: TileGrid, key: TileKey, have: Container[TileKey]) -> list[TileKey]:
+        """The tiles in reach of one that the map has, sorted."""
+        near = grid.keys_over(grid.core(key).grown(self.reach_mm))
+        return [k for k in near if k in have]
+
+    def identity(self, grid: TileGrid, key: TileKey, have: Mapping[TileKey, str]) -> str:
+        """The identity that the table of a tile has, or will have.
+
+        Args:
+            grid: the tiles.
+            key: the tile.
+            have: the identity of the points of each tile of the map, at least of those in reach.
+        """
+        near = self.tiles(grid, key, have)
+        below = self.reads
+        if below is None:
+            inputs = [(str(k), have[k]) for k in near]
+        else:
+            inputs = [(str(k), below.identity(grid, k, have)) for k in near]
+        takes = {**self.takes, "tile": key}
+        return identity_of(self.stage, self.version, takes, {"map_part": [hash_of(inputs)]})
