@@ -26,7 +26,7 @@ from tilestream.cli.app import COMMANDS, command_of
 from tilestream.cli.options import parse_bytes
 from tilestream.cli.progress import progress
 from tilestream.errors import UsageError
-from tilestream.formats.logs.mcap import open_log
+from tilestream.formats.logs import open_log
 from tilestream.formats.points.las import write_las
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.formats.points.ply import write_ply

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-import tilestream.formats as formats
 from tilestream.errors import CorruptSourceError, UnknownFormatError
 from tilestream.formats import Block, open_source
+from tilestream.formats.points import e57
 
 pye57 = pytest.importorskip("pye57", reason="E57 is an extra")
 libe57 = pye57.libe57
@@ -145,6 +145,6 @@ def test_without_the_extra_the_error_says_what_to_install(
 ) -> None:
     with pye57.E57(str(tmp_path / "a.e57"), "w") as file:
         file.write_scan_raw(scan_of(local_points()))
-    monkeypatch.setattr(formats, "e57", None)
+    monkeypatch.setattr(e57, "libe57", None)
     with pytest.raises(UnknownFormatError, match=r"pip install 'tilestream\[e57\]'"):
         open_source(tmp_path / "a.e57")

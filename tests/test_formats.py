@@ -267,8 +267,8 @@ def test_content_of_no_format_is_refused(tmp_path: Path) -> None:
 
 
 def test_an_empty_file_is_cut_short(tmp_path: Path) -> None:
-    for format_ in FORMATS:
-        path = tmp_path / f"a{format_.endings[0]}"
+    for ending in (ending for format_ in FORMATS for ending in format_.endings):
+        path = tmp_path / f"a{ending}"
         path.write_bytes(b"")
         with pytest.raises(CorruptSourceError, match="empty or cut short"):
             open_source(path)

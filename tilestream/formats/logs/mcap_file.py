@@ -23,7 +23,7 @@ from mcap.records import Channel, Chunk, Schema
 from mcap.stream_reader import CRCValidationError, get_chunk_data_stream
 from mcap.summary import Summary
 
-from tilestream.errors import CorruptSourceError, SourceNotFoundError, UnknownFormatError
+from tilestream.errors import CorruptSourceError, SourceNotFoundError
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = struct.Struct("<BQ")
@@ -72,12 +72,11 @@ class McapFile:
     whether some of them lay in records without a CRC, where damage cannot be seen.
 
     Args:
-        path: the file.
+        path: the file, which begins with `MAGIC`.
         topics: False leaves out what only `unpack` does not need: summary and topics.
 
     Raises:
         SourceNotFoundError: no such file.
-        UnknownFormatError: the file does not begin as an MCAP file does.
         CorruptSourceError: a checksum fails, or records contradict each other; names file, offset.
     """
 
@@ -87,13 +86,9 @@ class McapFile:
             self._stream = Path(path).open("rb")  # noqa: SIM115 - __exit__ closes it
         except FileNotFoundError:
             raise SourceNotFoundError(f"{path}: no such file") from None
-        except IsADirectoryError:
-            raise UnknownFormatError(
-                f"{path}: a directory, not an MCAP file; name the .mcap files in it"
-            ) from None
         try:
             self.size = self._stream.seek(0, io.SEEK_END)
-            self.whole = self._check_magic()
+            self.whole = self._ends_whole()
             self.lost: str | None = None
             self.unchecked = False
             self._channels: dict[int, tuple[str, str, str]] = {}
@@ -143,16 +138,7 @@ class McapFile:
         opcode, content = self._record(record)
         return self._unpacked(record, opcode, content)
 
-    def _check_magic(self) -> bool:
-        head = self._read(0, len(MAGIC))
-        if head != MAGIC[: len(head)]:
-            raise UnknownFormatError(
-                f"{self.path}: not an MCAP file (it begins with {head!r}); rename it or convert it"
-            )
-        if len(head) < len(MAGIC):
-            raise CorruptSourceError(
-                f"{self.path}: cut short after {self.size} bytes; copy it anew"
-            )
+    def _ends_whole(self) -> bool:
         return (
             self.size >= 2 * len(MAGIC) + FOOTER.size
             and self._read(self.size - len(MAGIC), len(MAGIC)) == MAGIC

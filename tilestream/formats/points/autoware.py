@@ -8,11 +8,12 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
-from tilestream.errors import CorruptSourceError, SourceNotFoundError, UnknownFormatError
+from tilestream.errors import CorruptSourceError, SourceNotFoundError
 from tilestream.formats.base import Block, SourceInfo, Span
 from tilestream.formats.points.pcd import PcdSource, open_pcd
 from tilestream.formats.points.rows import whole_span
 from tilestream.formats.projector import METADATA, PROJECTOR, read_projector, read_yaml
+from tilestream.formats.registry import Format
 
 _INSIDE = "pointcloud_map.pcd"
 """The sub-directory into which Autoware puts the PCD files."""
@@ -75,25 +76,14 @@ class MapDirectory:
                 yield from part.blocks(Span(first, last), block_points)
 
 
-def is_map_directory(path: Path) -> bool:
-    """Whether a directory has the metadata of a divided map."""
-    return (path / METADATA).is_file()
-
-
 def open_map_directory(path: str) -> MapDirectory:
     """A divided map; its metadata is read, and every file that it lists is there.
 
     Raises:
-        UnknownFormatError: the directory has no metadata.
         CorruptSourceError: the metadata cannot be read, or names a file outside of the directory.
-        SourceNotFoundError: files that it lists are missing; names them.
+        SourceNotFoundError: the metadata or files that it lists are missing; names them.
     """
     folder = Path(path)
-    if not is_map_directory(folder):
-        raise UnknownFormatError(
-            f"{path}: a directory without {METADATA} is no divided map; give its files, e.g. "
-            f"'{path}/*.pcd'"
-        )
     metadata = folder / METADATA
     content = read_yaml(metadata)
     resolution = (
@@ -120,6 +110,14 @@ def open_map_directory(path: str) -> MapDirectory:
             *_unlisted(folder, set(files)),
         ),
     )
+
+
+FORMAT = Format(
+    name="Autoware's divided map",
+    what="its PCD files, with CRS",
+    open=open_map_directory,
+    marker=METADATA,
+)
 
 
 def _resolution(value: Any, name: str, metadata: Path) -> float:

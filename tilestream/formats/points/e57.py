@@ -12,15 +12,22 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pye57 import libe57
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
-from tilestream.errors import CorruptSourceError
+from tilestream.errors import CorruptSourceError, UnknownFormatError
 from tilestream.formats.base import Block, SourceInfo, Span
 from tilestream.formats.points.rows import finite_block, whole_span
+from tilestream.formats.registry import Format
 from tilestream.kernels.fixed_order import turned
 from tilestream.records import Float64
+
+try:
+    from pye57 import libe57
+except ModuleNotFoundError as missing:
+    if missing.name != "pye57":
+        raise
+    libe57 = None  # the extra is not installed
 
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
@@ -113,9 +120,12 @@ def open_e57(path: str) -> E57Source:
     """An E57 file; the headers of its scans are read.
 
     Raises:
+        UnknownFormatError: the extra is not installed.
         CorruptSourceError: the file is cut short or damaged, or a scan has no coordinates that can
             be read, no proper pose, or claims more points than the file holds.
     """
+    if libe57 is None:
+        raise UnknownFormatError(f"{path}: E57 needs an extra: pip install 'tilestream[e57]'")
     size_bytes = Path(path).stat().st_size
     with _image(path) as image, _libe57_errors(path, "its header"):
         root = image.root()
@@ -131,6 +141,15 @@ def open_e57(path: str) -> E57Source:
         for i, scan in enumerate(scans)
     )
     return E57Source(path, tuple(scans), size_bytes, crs, notes)
+
+
+FORMAT = Format(
+    name="E57",
+    what="cartesian or spherical scans with their poses (extra `e57`)",
+    open=open_e57,
+    endings=(".e57",),
+    magic=b"ASTM-E57",
+)
 
 
 @contextmanager

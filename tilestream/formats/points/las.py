@@ -30,11 +30,10 @@ from tilestream.formats.points.rows import (
     whole_span,
     writing_whole,
 )
+from tilestream.formats.registry import Format
 
 logging.getLogger("laspy").addHandler(logging.NullHandler())  # its errors are raised as ours
 
-MAGIC = b"LASF"
-"""How every LAS and LAZ file begins."""
 _HEADER = struct.Struct("<4s90xHIIBHI")
 """Magic, header size, where the points start, number of VLRs, point format, point size, points."""
 _HEADER_1_4 = struct.Struct("<QIQ")
@@ -166,6 +165,15 @@ def open_las(path: str) -> LasSource:
         notes=notes,
     )
     return LasSource(path, rows, chunks, packing, dtype, summary)
+
+
+FORMAT = Format(
+    name="LAS",
+    what="1.0 to 1.4, LAZ and COPC, with CRS",
+    open=open_las,
+    endings=(".las", ".laz"),
+    magic=b"LASF",
+)
 
 
 @contextmanager

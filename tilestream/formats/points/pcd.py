@@ -27,6 +27,7 @@ from tilestream.formats.points.rows import (
     writing_whole,
 )
 from tilestream.formats.projector import crs_beside
+from tilestream.formats.registry import Format
 from tilestream.kernels import lzf
 
 _KEYWORDS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS")
@@ -162,6 +163,16 @@ def open_pcd(path: str) -> PcdSource:
     if left > 0:
         notes += (f"{left} bytes behind the last point are ignored",)
     return PcdSource(path, encoding, layout.fields, rows, size_bytes, packed, unpacked, crs, notes)
+
+
+FORMAT = Format(
+    name="PCD",
+    what="ascii, binary, binary_compressed",
+    open=open_pcd,
+    endings=(".pcd",),
+    magic=b"# .PCD",
+    recognise=looks_like_pcd,
+)
 
 
 def _read_header(file: BinaryIO, path: str) -> tuple[dict[str, list[str]], int]:

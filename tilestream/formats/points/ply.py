@@ -23,9 +23,8 @@ from tilestream.formats.points.rows import (
     table_of,
     writing_whole,
 )
+from tilestream.formats.registry import Format
 
-MAGIC = b"ply"
-"""The first line of every PLY file."""
 _HEADER_MAX = 1 << 20
 """Longest header that is read [bytes]."""
 _TYPES = {
@@ -151,6 +150,16 @@ def open_ply(path: str) -> PlySource:
     notes = tuple(f"element {other.name!r} ({other.count} rows) is ignored" for other in others)
     fields = tuple((p.name, p.dtype.name) for p in vertex.properties)
     return PlySource(path, encoding, fields, rows, size_bytes, notes)
+
+
+FORMAT = Format(
+    name="PLY",
+    what="ascii, binary of either byte order",
+    open=open_ply,
+    endings=(".ply",),
+    magic=b"ply",
+    recognise=looks_like_ply,
+)
 
 
 def _read_header(file: BinaryIO, path: str) -> tuple[str, list[_Element], int]:

@@ -19,7 +19,7 @@ from tilestream.errors import (
     UnknownFormatError,
     UsageError,
 )
-from tilestream.formats.logs.mcap import open_log
+from tilestream.formats.logs import open_log
 from tilestream.formats.routes.files import Path3, read_csv, read_geojson, read_poses
 from tilestream.formats.routes.lanelet2 import read_lanelet2
 from tilestream.kernels.fixed_order import norms
@@ -61,7 +61,7 @@ def read_routes(
     * `.geojson`, `.json`: every LineString; of a MultiLineString each part;
     * `.osm`: Lanelet2; centre lines of the lanelets for vehicles, joined as long as one follows the
       other without a fork; in `local_x`, `local_y` where every node has them, else degrees;
-    * `.mcap`: the poses of a log, see `mcap.open_log`.
+    * `.mcap`: the poses of a log, see `logs.open_log`.
 
     Points that repeat the last one within 1 cm are dropped and counted. A path that turns back is
     kept, the heading follows it. The order of a file's routes is the file's.
