@@ -2,6 +2,7 @@
 slice, and as points of a map."""
 
 import pickle
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from points import points_of
 from tilestream.errors import (
     CorruptSourceError,
     PoseError,
+    SourceError,
     SourceNotFoundError,
     UnknownFormatError,
     UsageError,
@@ -152,8 +154,16 @@ def test_a_changed_log_is_read_anew(name: str, tmp_path: Path) -> None:
     CASES[name](tmp_path, later, replace(poses, stamps_ns=poses.stamps_ns + SECOND))
     assert len(open_log(path)) == 7
     assert len(before) == 4
-    with pytest.raises(CorruptSourceError, match=path.name):
+    with pytest.raises(SourceError, match=path.name):
         list(before.scans())
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_log_that_is_gone(name: str, tmp_path: Path) -> None:
+    log = open_log(CASES[name](tmp_path, *street(4)))
+    shutil.rmtree(tmp_path)
+    with pytest.raises(SourceNotFoundError, match="changed since it was opened"):
+        list(log.scans())
 
 
 @pytest.mark.parametrize("name", CASES)

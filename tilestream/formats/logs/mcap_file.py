@@ -23,7 +23,7 @@ from mcap.records import Channel, Chunk, Schema
 from mcap.stream_reader import CRCValidationError, get_chunk_data_stream
 from mcap.summary import Summary
 
-from tilestream.errors import CorruptSourceError, SourceNotFoundError
+from tilestream.errors import CorruptSourceError
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = struct.Struct("<BQ")
@@ -76,16 +76,13 @@ class McapFile:
         topics: False leaves out what only `unpack` does not need: summary and topics.
 
     Raises:
-        SourceNotFoundError: no such file.
+        OSError: there is no such file.
         CorruptSourceError: a checksum fails, or records contradict each other; names file, offset.
     """
 
     def __init__(self, path: str, *, topics: bool = True) -> None:
         self.path = path
-        try:
-            self._stream = Path(path).open("rb")  # noqa: SIM115 - __exit__ closes it
-        except FileNotFoundError:
-            raise SourceNotFoundError(f"{path}: no such file") from None
+        self._stream = Path(path).open("rb")  # noqa: SIM115 - __exit__ closes it
         try:
             self.size = self._stream.seek(0, io.SEEK_END)
             self.whole = self._ends_whole()

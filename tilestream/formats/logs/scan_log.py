@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tilestream.errors import CorruptSourceError, PoseError
+from tilestream.errors import CorruptSourceError, PoseError, SourceNotFoundError
 from tilestream.formats.base import SourceInfo
 from tilestream.formats.logs.base import RecordedScan, Recording
 from tilestream.formats.logs.drivers import returned, time_offsets
@@ -45,6 +45,7 @@ class ScanLog(Recording):
 
         Raises:
             CorruptSourceError: the log is damaged, or is not the one that was opened.
+            SourceNotFoundError: it is no longer there.
         """
         return self.scans_at(np.arange(len(self))[start:stop:step])
 
@@ -56,12 +57,14 @@ class ScanLog(Recording):
 
     def recorded_at(self, indices: list[int]) -> Iterator[RecordedScan]:
         """Some scans as they were recorded, posed or not; errors as for `scans`."""
-        for index, recorded in zip(indices, self.reader.read(indices), strict=True):
-            if recorded.stamp_ns != self.stamps_ns[index]:
-                raise CorruptSourceError(
-                    f"{self.path}: has changed since it was opened; open it again"
-                )
-            yield recorded
+        changed = f"{self.path}: has changed since it was opened; open it again"
+        try:
+            for index, recorded in zip(indices, self.reader.read(indices), strict=True):
+                if recorded.stamp_ns != self.stamps_ns[index]:
+                    raise CorruptSourceError(changed)
+                yield recorded
+        except FileNotFoundError as error:
+            raise SourceNotFoundError(f"{changed} ({error})") from error
 
     def info(self, indices: Int64 | None = None) -> SourceInfo:
         """What is in the log; of the scans, those given by index (default: all)."""
