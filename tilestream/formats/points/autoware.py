@@ -10,8 +10,8 @@ from typing import Any
 
 from tilestream.errors import CorruptSourceError, SourceNotFoundError
 from tilestream.formats.base import Block, SourceInfo, Span
-from tilestream.formats.points.pcd import PcdSource, open_pcd
-from tilestream.formats.points.rows import whole_span
+from tilestream.formats.points.pcd import open_pcd
+from tilestream.formats.points.rows import RowSource, whole_span
 from tilestream.formats.projector import METADATA, PROJECTOR, read_projector, read_yaml
 from tilestream.formats.registry import Format
 
@@ -37,7 +37,7 @@ class MapDirectory:
     """What else a user should know: projector, files that are not listed."""
 
     @cached_property
-    def _parts(self) -> tuple[PcdSource, ...]:
+    def _parts(self) -> tuple[RowSource, ...]:
         return tuple(open_pcd(path) for path in self.files)
 
     @cached_property
@@ -49,12 +49,14 @@ class MapDirectory:
         return SourceInfo(
             path=self.path,
             format="autoware divided map",
-            size_bytes=sum(part.size_bytes for part in self._parts),
+            size_bytes=sum(part.summary.size_bytes for part in self._parts),
             points=self._starts[-1],
             bounds=None,
-            fields=tuple(dict.fromkeys(field for part in self._parts for field in part.fields)),
+            fields=tuple(
+                dict.fromkeys(field for part in self._parts for field in part.summary.fields)
+            ),
             crs=self.crs,
-            resident_bytes=max((part.info().resident_bytes for part in self._parts), default=0),
+            resident_bytes=max((part.summary.resident_bytes for part in self._parts), default=0),
             notes=self.notes,
         )
 

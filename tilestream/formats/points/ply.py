@@ -2,8 +2,8 @@
 
 import os
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
@@ -11,15 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tilestream.errors import CorruptSourceError, UnknownFormatError, UsageError
-from tilestream.formats.base import Block, SourceInfo, Span
+from tilestream.formats.base import SourceInfo
 from tilestream.formats.points.rows import (
     BinaryRows,
-    Column,
-    Columns,
+    RowSource,
     TextRows,
     as_points,
     as_text,
-    even_spans,
+    columns_of,
     table_of,
     writing_whole,
 )
@@ -76,49 +75,9 @@ class _Element:
         return sum(p.dtype.itemsize for p in self.properties)
 
 
-@dataclass(frozen=True)
-class PlySource:
-    """A PLY file; x, y and z may be of any numeric type."""
-
-    path: str
-    """The file, as it was named."""
-    encoding: str
-    """How it is written."""
-    fields: tuple[tuple[str, str], ...]
-    """Name and type of every property of a vertex."""
-    rows: BinaryRows | TextRows
-    """Where the vertices lie."""
-    size_bytes: int
-    """Size of the file [bytes]."""
-    notes: tuple[str, ...] = ()
-    """What else a user should know."""
-
-    def info(self) -> SourceInfo:
-        """What the header tells."""
-        return SourceInfo(
-            path=self.path,
-            format=f"ply {self.encoding}",
-            size_bytes=self.size_bytes,
-            points=self.rows.count,
-            bounds=None,
-            fields=self.fields,
-            crs=None,
-            resident_bytes=0,
-            notes=self.notes,
-        )
-
-    def spans(self, points: int) -> list[Span]:
-        """Any pieces of a binary file; text is read from its beginning: one span."""
-        count = self.rows.count
-        return even_spans(count, max(count, points) if self.encoding == "ascii" else points)
-
-    def blocks(self, span: Span, block_points: int) -> Iterator[Block]:
-        """The points of a span in blocks; see `PointSource.blocks`."""
-        return self.rows.blocks(span, block_points)
-
-
-def open_ply(path: str) -> PlySource:
-    """A PLY file; its header is read and checked against the size of the file.
+def open_ply(path: str) -> RowSource:
+    """A PLY file; its header is read and checked against the size of the file. x, y and z may be of
+    any numeric type.
 
     Raises:
         CorruptSourceError: the header is incomplete, contradicts itself, names a type that PLY does
@@ -135,21 +94,31 @@ def open_ply(path: str) -> PlySource:
             f"{path}: its first element, {vertex.name!r}, is not a vertex of plain numbers; write "
             "it again with the vertices first and without lists"
         )
-    order = _BYTE_ORDER[encoding]
+    names = [p.name for p in vertex.properties]
+    types = [p.dtype.newbyteorder(_BYTE_ORDER[encoding]) for p in vertex.properties]
     rows: BinaryRows | TextRows
     if encoding == "ascii":
-        columns = _columns(vertex, [1] * len(vertex.properties), order, path)
         more = any(other.count for other in others)
-        rows = TextRows(path, offset, len(vertex.properties), vertex.count, columns, more)
+        columns = columns_of(names, range(len(names)), types, path)
+        rows = TextRows(path, offset, len(names), vertex.count, columns, more)
     else:
-        widths = [p.dtype.itemsize for p in vertex.properties]
-        columns = _columns(vertex, widths, order, path)
+        ends = list(accumulate(t.itemsize for t in types))
+        columns = columns_of(names, [0, *ends], types, path)
         rows = BinaryRows(path, offset, vertex.row_bytes, vertex.count, columns)
         _check_others(rows, others, size_bytes)
     rows.check_size(size_bytes)
-    notes = tuple(f"element {other.name!r} ({other.count} rows) is ignored" for other in others)
-    fields = tuple((p.name, p.dtype.name) for p in vertex.properties)
-    return PlySource(path, encoding, fields, rows, size_bytes, notes)
+    summary = SourceInfo(
+        path=path,
+        format=f"ply {encoding}",
+        size_bytes=size_bytes,
+        points=vertex.count,
+        bounds=None,
+        fields=tuple((p.name, p.dtype.name) for p in vertex.properties),
+        crs=None,
+        resident_bytes=0,
+        notes=tuple(f"element {other.name!r} ({other.count} rows) is ignored" for other in others),
+    )
+    return RowSource(summary, rows)
 
 
 FORMAT = Format(
@@ -206,21 +175,6 @@ def _property(described: list[str], element: str, path: str) -> _Property:
         f"{path}: property {' '.join(described)[:80]!r} of element {element!r} has an unknown "
         f"type; PLY has {', '.join(_TYPES)}"
     )
-
-
-def _columns(vertex: _Element, widths: list[int], order: _ByteOrder, path: str) -> Columns:
-    names = [p.name for p in vertex.properties]
-
-    def column(name: str) -> Column:
-        if names.count(name) != 1:
-            raise CorruptSourceError(
-                f"{path}: has {names.count(name)} vertex properties {name!r} among "
-                f"{' '.join(names)}; points need x, y and z"
-            )
-        i = names.index(name)
-        return Column(sum(widths[:i]), vertex.properties[i].dtype.newbyteorder(order))
-
-    return column("x"), column("y"), column("z")
 
 
 def _check_others(rows: BinaryRows, others: list[_Element], size_bytes: int) -> None:
