@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import plyfile
 
 from tilestream.formats import Block, open_source
 
@@ -32,6 +33,11 @@ end_header
 1 2 3
 4 5 6
 """
+
+
+def write_ply(path: Path, points: np.ndarray, byte_order: str = "<", text: bool = False) -> None:
+    vertex = plyfile.PlyElement.describe(np.rec.fromarrays(points.T, names="x,y,z"), "vertex")
+    plyfile.PlyData([vertex], text=text, byte_order=byte_order).write(str(path))
 
 
 def blocks_of(

@@ -9,7 +9,6 @@ from points import PLY_TEXT, points_of
 
 from tilestream.errors import CorruptSourceError, UnknownFormatError
 from tilestream.formats import open_source
-from tilestream.formats.points.ply import write_ply
 
 
 @pytest.mark.parametrize("dtype", ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"])
@@ -30,18 +29,6 @@ def test_what_plyfile_writes(dtype: str, text: bool, order: str, tmp_path: Path)
     truth = np.column_stack([vertex[axis] for axis in "xyz"]).astype(float)
     assert np.array_equal(points_of(tmp_path / "a.ply"), truth)
     assert open_source(tmp_path / "a.ply").info().notes == ("element 'face' (3 rows) is ignored",)
-
-
-@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
-def test_plyfile_reads_what_we_write(encoding: str, tmp_path: Path) -> None:
-    points = np.random.default_rng(0).uniform(4e6, 4e6 + 100, (60, 3))
-    fields = {"ring": np.arange(60, dtype=np.uint16), "i": np.arange(60, dtype=np.float32)}
-    write_ply(tmp_path / "a.ply", points, fields=fields, encoding=encoding)  # type: ignore[arg-type]
-    vertex = plyfile.PlyData.read(str(tmp_path / "a.ply"))["vertex"]
-    assert np.array_equal(np.column_stack([vertex[axis] for axis in "xyz"]), points)
-    for name, values in fields.items():
-        assert np.array_equal(vertex[name], values)
-        assert vertex[name].dtype.newbyteorder("=") == values.dtype
 
 
 def test_lines_of_either_end(tmp_path: Path) -> None:

@@ -10,10 +10,9 @@ import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
@@ -53,8 +52,6 @@ class Message:
 
     topic: str
     """Name of its topic."""
-    log_time: int
-    """When it was recorded [ns]."""
     record: int
     """Offset in the file of the chunk, or of the message outside of chunks, that holds it."""
     start: int
@@ -65,7 +62,7 @@ class Message:
     """Its content."""
 
 
-class McapFile:
+class McapFile(AbstractContextManager["McapFile"]):
     """An MCAP file that is open for reading.
 
     Once messages were read, `lost` says what a cut file lacks (None: nothing), and `unchecked`
@@ -96,15 +93,7 @@ class McapFile:
             self._stream.close()
             raise
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stream.close()
 
     def messages(self, topics: Iterable[str]) -> Iterator[Message]:
@@ -119,14 +108,14 @@ class McapFile:
                     continue
                 if stop - start < MESSAGE_HEAD.size:
                     raise self._corrupt(record, "holds a message shorter than its own head")
-                channel, _, log_time, _ = MESSAGE_HEAD.unpack_from(content, start)
+                channel, *_ = MESSAGE_HEAD.unpack_from(content, start)
                 if channel not in self._channels:
                     raise self._corrupt(record, f"holds a message of the unknown channel {channel}")
                 topic = self._channels[channel][0]
                 if topic in wanted:
                     start += MESSAGE_HEAD.size
                     data = memoryview(content)[start:stop]
-                    yield Message(topic, log_time, record, start, len(content), data)
+                    yield Message(topic, record, start, len(content), data)
 
     def unpack(self, record: int) -> bytes:
         """The records inside the chunk at an offset of the file, or the record itself where a

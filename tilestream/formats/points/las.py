@@ -1,4 +1,9 @@
-"""LAS and LAZ (also COPC, which reads as LAZ), the formats of surveyors."""
+"""LAS and LAZ (also COPC, which reads as LAZ), the formats of surveyors.
+
+laspy reads the headers and writes the files. Points are read past it: plain ones as the rows that
+they are, packed ones chunk by chunk with lazrs, whose own seek, on which laspy relies, goes astray
+where chunks differ in size (COPC). What a header claims is checked before either allocates by it.
+"""
 
 import logging
 import math
