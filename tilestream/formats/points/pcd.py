@@ -1,4 +1,9 @@
-"""PCD, the point clouds of PCL and Autoware: ascii, binary and binary_compressed."""
+"""PCD, the point clouds of PCL and Autoware: ascii, binary and binary_compressed.
+
+Open3D, the one dependency that reads PCD too, holds a whole file at once, reads coordinates in
+float64 as zeros, and a file that is cut short as an empty cloud (0.20). No dependency brings LZF,
+the compression of the third encoding: it is a kernel (`kernels/lzf.py`).
+"""
 
 import os
 import re
