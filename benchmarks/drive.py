@@ -2,7 +2,7 @@
 
     python benchmarks/drive.py [LOG] [--out FOLDER] [--workers N] [--figures FOLDER]
 
-As recorded, and as lesser sensors would have seen it, with the default and the production matcher.
+As recorded, and as simpler sensors would have seen it, with the default and the production matcher.
 Prints the tables of RESULTS.md and draws drive_errors.png (needs matplotlib). LOG is an MCAP log
 with point clouds and poses; default: the drive under TILESTREAM_DATA.
 """
@@ -71,14 +71,14 @@ def measure(log: Path, folder: Path, workers: int) -> dict[tuple[str, str], pd.D
     found = {}
     with dask_client(None, workers, DEFAULT_MEMORY) as client:
         for matcher, registration in MATCHERS.items():
-            for sensor, lesser in SENSORS.items():
+            for sensor, simpler in SENSORS.items():
                 found[sensor, matcher] = ts.localize(
                     store,
                     log,
                     folder / matcher / sensor.replace(" ", "_").replace(",", ""),
                     registration=registration,
                     scans=LOCALIZED,
-                    reading=Reading(str(log), **lesser),  # type: ignore[arg-type]
+                    reading=Reading(str(log), **simpler),  # type: ignore[arg-type]
                     client=client,
                 )
     return found

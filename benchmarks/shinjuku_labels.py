@@ -44,7 +44,7 @@ import pandas as pd
 from scipy.stats import ks_2samp
 
 import tilestream as ts
-from tilestream.formats.logs.mcap import ScanSelection
+from tilestream.formats.logs import ScanSelection
 from tilestream.grid import Box
 from tilestream.pipeline.engine.cluster import dask_client
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY

@@ -62,7 +62,7 @@ from tilestream.factors.observability import (
 from tilestream.factors.surfels import surfel_mm, surfels_in, tile_surfels
 from tilestream.factors.virtual_drive import physics_offset, stratified_starts, virtual_drive
 from tilestream.factors.virtual_scan import Beams, Scene, VirtualSettings, virtual_scan
-from tilestream.formats.logs.mcap import open_log
+from tilestream.formats.logs import open_log
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.formats.routes import route_of
 from tilestream.grid import MM_PER_M
@@ -314,7 +314,7 @@ def against(table: pd.DataFrame, estimates: dict[str, dict[str, str]]) -> pd.Dat
 # --- 3. The real drive, over sensors
 
 
-def lesser(drive: DriveSettings) -> tuple[ts.Sensor, dict[str, Any]]:
+def sensor_of(drive: DriveSettings) -> tuple[ts.Sensor, dict[str, Any]]:
     """The HDL-64E of the drive as the run thinned it, and how the vehicle sees with it."""
     full = np.array(ts.HDL64.elevations_deg)
     kept = full if drive.beams is None else np.linspace(full[0], full[-1], drive.beams)
@@ -333,7 +333,7 @@ def sensors(run: Path, changes: dict[str, Any]) -> None:
     for drive in settings.drives:
         labels = errors_of(run, drive.group)
         places, headings = labels[["x", "y", "z"]].to_numpy(), labels["heading"].to_numpy()
-        sensor, seen = lesser(drive)
+        sensor, seen = sensor_of(drive)
         seeing = VirtualSettings(**(seen | changes))
         found = observability(store, places, headings, sensor, seeing, settings.label.registration)
         done = (found["status"] == "done").to_numpy()

@@ -10,10 +10,25 @@ from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer
 from scipy.spatial.transform import Rotation
 
-from tilestream.formats.logs.mcap_write import ODOMETRY_SCHEMA, POINT_CLOUD_SCHEMA, TF_SCHEMA
+from tilestream.formats.logs.mcap_write import ODOMETRY_SCHEMA, POINT_CLOUD_SCHEMA
 
 DATATYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 POSE_PARTS = ODOMETRY_SCHEMA[ODOMETRY_SCHEMA.index("=====") :]
+TF_SCHEMA = (
+    """\
+geometry_msgs/TransformStamped[] transforms
+================================================================================
+MSG: geometry_msgs/TransformStamped
+std_msgs/Header header
+string child_frame_id
+geometry_msgs/Transform transform
+================================================================================
+MSG: geometry_msgs/Transform
+geometry_msgs/Vector3 translation
+geometry_msgs/Quaternion rotation
+"""
+    + POSE_PARTS
+)
 SCHEMAS = {
     "sensor_msgs/msg/PointCloud2": POINT_CLOUD_SCHEMA,
     "nav_msgs/msg/Odometry": ODOMETRY_SCHEMA,

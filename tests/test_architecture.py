@@ -1,6 +1,7 @@
 """Imports go down only: the floors of the house, read from the code itself."""
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -41,6 +42,8 @@ KNOWN_ONLY_BY = {
     "typer": {"cli"},
     "jinja2": {"report"},
 }
+OF_FORMATS = re.compile(r"tilestream\.formats\.logs\.(mcap|ros2)")
+"""One format of logs: everything else reads any log, through `formats.logs`."""
 
 
 def modules() -> list[Path]:
@@ -80,6 +83,8 @@ def broken_arrows(path: Path, source: str) -> list[str]:
         where = f"{path.name}:{node.lineno}"
         if top in KNOWN_ONLY_BY and room not in KNOWN_ONLY_BY[top]:
             found.append(f"{where} {room} may not know {top}")
+        if OF_FORMATS.match(name) and room != "formats":
+            found.append(f"{where} {room} may not know {name}")
         if top != "tilestream" or rest in ("", "__version__"):
             continue
         target = room_of(rest)
@@ -139,6 +144,7 @@ def test_a_broken_arrow_is_seen() -> None:
         (ROOT / "label.py", "from tilestream.factors.table import factors"),
         (ROOT / "pipeline" / "engine" / "plan.py", "from tilestream.pipeline.stages import merge"),
         (ROOT / "ndt.py", "from tilestream import label"),
+        (ROOT / "cli" / "maps.py", "from tilestream.formats.logs.mcap import open_mcap"),
     ):
         assert broken_arrows(path, source), source
 

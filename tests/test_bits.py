@@ -229,7 +229,7 @@ MAY = {
     "factors/local_similarity.py": "the weights of a fit: a constant",
     "factors/observability.py": "6 x 6 of one place",
     "factors/virtual_drive.py": "over the starts of one place",
-    "formats/logs/log_poses.py": "4 x 4 of one pose",
+    "formats/logs/ros2_poses.py": "4 x 4 of one pose",
     "formats/logs/poses.py": "4 x 4 of one pose",
     "kernels/neighbours.py": "whole numbers",
     "label.py": "3 x 3 of one pose",

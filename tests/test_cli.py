@@ -16,6 +16,7 @@ from elsewhere import certificates, scheduler_elsewhere
 from logs import START, pose
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from points import write_ply
 from rich.console import Console
 from scenes import PLACES, in_map
 from scipy.spatial.transform import Rotation
@@ -26,10 +27,9 @@ from tilestream.cli.app import COMMANDS, command_of
 from tilestream.cli.options import parse_bytes
 from tilestream.cli.progress import progress
 from tilestream.errors import UsageError
-from tilestream.formats.logs.mcap import open_log
+from tilestream.formats.logs import open_log
 from tilestream.formats.points.las import write_las
 from tilestream.formats.points.pcd import write_pcd
-from tilestream.formats.points.ply import write_ply
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.cluster import TlsFiles
 

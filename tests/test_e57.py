@@ -4,19 +4,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from points import blocks_of, points_of
 from scipy.spatial.transform import Rotation
 
-import tilestream.formats as formats
 from tilestream.errors import CorruptSourceError, UnknownFormatError
-from tilestream.formats import Block, open_source
+from tilestream.formats import open_source
+from tilestream.formats.points import e57
 
 pye57 = pytest.importorskip("pye57", reason="E57 is an extra")
 libe57 = pye57.libe57
-
-
-def blocks_of(path: Path, block_points: int = 33) -> list[Block]:
-    source = open_source(path)
-    return [b for span in source.spans(10) for b in source.blocks(span, block_points)]
 
 
 def local_points(n: int = 200) -> np.ndarray:
@@ -40,7 +36,7 @@ def test_each_scan_has_its_pose(tmp_path: Path) -> None:
             w = np.roll(rotation.as_quat(), 1)
             file.write_scan_raw(scan_of(local_points()), rotation=w, translation=place)
     truth = np.concatenate([rotation.apply(local_points()) + place for rotation, place in poses])
-    assert np.abs(np.concatenate([b.points for b in blocks_of(path)]) - truth).max() < 1e-8
+    assert np.abs(points_of(path) - truth).max() < 1e-8
     assert [(s.start, s.stop) for s in open_source(path).spans(10)] == [
         (0, 200), (200, 400), (400, 600)
     ]  # fmt: skip
@@ -102,7 +98,7 @@ def test_spherical_coordinates_and_a_pose_in_any_order(tmp_path: Path) -> None:
     half = np.sqrt(0.5)
     pose = {"k": half, "i": 0.0, "w": half, "j": 0.0, "z": 1.0, "x": 4e6, "y": 0.0}
     write_raw(tmp_path / "a.e57", columns, pose)
-    got = np.concatenate([b.points for b in blocks_of(tmp_path / "a.e57")])
+    got = points_of(tmp_path / "a.e57")
     assert np.abs(got - np.column_stack([4e6 - y, x, z + 1])).max() < 1e-8
     assert open_source(tmp_path / "a.e57").info().crs == "EPSG:32654"
 
@@ -145,6 +141,6 @@ def test_without_the_extra_the_error_says_what_to_install(
 ) -> None:
     with pye57.E57(str(tmp_path / "a.e57"), "w") as file:
         file.write_scan_raw(scan_of(local_points()))
-    monkeypatch.setattr(formats, "e57", None)
+    monkeypatch.setattr(e57, "libe57", None)
     with pytest.raises(UnknownFormatError, match=r"pip install 'tilestream\[e57\]'"):
         open_source(tmp_path / "a.e57")

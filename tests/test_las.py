@@ -9,18 +9,11 @@ import lazrs
 import numpy as np
 import pyproj
 import pytest
+from points import points_of
 
 from tilestream.errors import CorruptSourceError, CrsError
 from tilestream.formats import open_source
 from tilestream.formats.points.las import open_las, write_las
-
-
-def points_of(path: Path, span_points: int = 10**6, block_points: int = 777) -> np.ndarray:
-    source = open_source(path)
-    spans = source.spans(span_points)
-    return np.concatenate(
-        [block.points for span in spans for block in source.blocks(span, block_points)]
-    )
 
 
 def record_of(

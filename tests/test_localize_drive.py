@@ -18,8 +18,8 @@ from scenes import PLACES, in_map
 import tilestream as ts
 from tilestream.cli import run
 from tilestream.errors import PartialError, PoseError, TileNotReadyError, UsageError
-from tilestream.formats.logs.degrade import as_lesser
-from tilestream.formats.logs.mcap import open_log
+from tilestream.formats.logs import open_log
+from tilestream.formats.logs.degrade import degraded
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.label import refined_pose, start_poses
 from tilestream.marks import Mark
@@ -167,22 +167,22 @@ def test_every_label_is_that_of_localization_error(
             np.testing.assert_array_equal(mine[name], getattr(expected.registrations, name))
 
 
-def test_a_lesser_sensor_changes_the_labels_and_is_recorded(
+def test_a_simpler_sensor_changes_the_labels_and_is_recorded(
     store: ts.TileStore,
     drive: Path,
     plain: tuple[pd.DataFrame, Path],
     all_cells: Cells,
     tmp_path: Path,
 ) -> None:
-    lesser = Reading(str(drive), beams=8, range_max=12.0, blind_rear_deg=120.0)
-    labels = ts.localize(store, drive, tmp_path, starts=FEW, reading=lesser)
+    simpler = Reading(str(drive), beams=8, range_max=12.0, blind_rear_deg=120.0)
+    labels = ts.localize(store, drive, tmp_path, starts=FEW, reading=simpler)
     assert set(labels["as_sensor"]) == {"8 beams, 12 m, rear blind 120 deg"}
     assert set(plain[0]["as_sensor"]) == {"as recorded"}
     assert (labels["points"] < plain[0]["points"] / 2).all()
     assert not (labels["error_mean"] == plain[0]["error_mean"]).any()
     scan = next(open_log(drive).scans_at([7]))
     assert scan.T_map_lidar is not None
-    less = as_lesser(scan, beams=8, range_max=12.0, blind_rear_deg=120.0)
+    less = degraded(scan, beams=8, range_max=12.0, blind_rear_deg=120.0)
     expected = ts.localization_error(
         all_cells, less.points, scan.T_map_lidar, ts.disc_starts(0.4, 0.2)
     )
@@ -475,5 +475,5 @@ def test_the_real_drive_localizes_within_centimetres(shared_data: Path, tmp_path
     assert labels["error_mean"].mean() < 0.06
     assert (labels["p_fail"] == 0.0).all()
     less = Reading(str(log), beams=16, range_max=30.0, blind_rear_deg=120.0)
-    lesser = ts.localize(store, log, tmp_path / "less", scans=odd, starts=starts, reading=less)
-    assert lesser["error_mean"].mean() > labels["error_mean"].mean()
+    simpler = ts.localize(store, log, tmp_path / "less", scans=odd, starts=starts, reading=less)
+    assert simpler["error_mean"].mean() > labels["error_mean"].mean()

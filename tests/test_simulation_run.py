@@ -19,7 +19,7 @@ from killed import killed_after
 import tilestream as ts
 from tilestream.cli import run
 from tilestream.errors import PlanError, UsageError
-from tilestream.formats.logs.mcap import ScanSelection, open_log
+from tilestream.formats.logs import ScanSelection, open_log
 from tilestream.pipeline.engine.stage import BASE_BYTES
 from tilestream.pipeline.jobs.simulate import plan_simulation, simulate
 from tilestream.pipeline.stages import simulated

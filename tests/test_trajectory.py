@@ -1,4 +1,4 @@
-"""Poses between poses, what motion does to a scan, and what a lesser lidar would see."""
+"""Poses between poses, what motion does to a scan, and what a simpler lidar would see."""
 
 from dataclasses import replace
 
@@ -11,9 +11,9 @@ from logs import SECOND, START, pose
 from scipy.spatial.transform import Rotation, Slerp
 
 from tilestream.errors import PoseError, UsageError
-from tilestream.formats.logs.degrade import as_lesser
+from tilestream.formats.logs import open_log
+from tilestream.formats.logs.degrade import degraded
 from tilestream.formats.logs.deskew import Sweep, deskew
-from tilestream.formats.logs.mcap import open_log
 from tilestream.formats.logs.poses import (
     PoseStatus,
     compose,
@@ -181,7 +181,7 @@ def test_a_scan_beyond_the_poses_is_not_guessed() -> None:
         deskew(scan, until_stamp)
 
 
-# --- a lesser lidar
+# --- a simpler lidar
 
 
 def spinning(
@@ -209,7 +209,7 @@ def elevations_deg(scan: Scan) -> np.ndarray:
 @pytest.mark.parametrize(("recorded", "kept"), [(64, 16), (32, 16), (128, 64), (40, 16), (16, 16)])
 def test_whole_rings_remain_evenly_spread(recorded: int, kept: int) -> None:
     scan = spinning(recorded, columns=90)
-    rings = np.unique(as_lesser(scan, beams=kept).ring)
+    rings = np.unique(degraded(scan, beams=kept).ring)
     assert len(rings) == kept
     assert set(np.diff(rings)) <= {recorded // kept, -(-recorded // kept)}
     assert np.array_equal(rings, recorded - 1 - rings[::-1]) or recorded % kept == 0
@@ -218,11 +218,11 @@ def test_whole_rings_remain_evenly_spread(recorded: int, kept: int) -> None:
 def test_rings_numbered_in_any_order_and_rings_without_returns() -> None:
     scan = spinning(32, columns=90)
     shuffle = np.random.default_rng(0).permutation(32).astype(np.int32)
-    a, b = as_lesser(scan, beams=8), as_lesser(replace(scan, ring=shuffle[scan.ring]), beams=8)
+    a, b = degraded(scan, beams=8), degraded(replace(scan, ring=shuffle[scan.ring]), beams=8)
     np.testing.assert_array_equal(a.points, b.points)
     open_sky = scan.ring < 25
     seen = replace(scan, points=scan.points[open_sky], ring=scan.ring[open_sky], time_offset=None)
-    still = np.unique(as_lesser(seen, beams=8, recorded_beams=32).ring)
+    still = np.unique(degraded(seen, beams=8, recorded_beams=32).ring)
     assert set(still) == set(np.unique(a.ring)) & set(range(25))
 
 
@@ -230,29 +230,29 @@ def test_rings_numbered_in_any_order_and_rings_without_returns() -> None:
 @pytest.mark.parametrize(("recorded", "kept"), [(64, 16), (32, 8)])
 def test_without_rings_slices_of_elevation_remain(recorded: int, kept: int, told: bool) -> None:
     scan = replace(spinning(recorded), ring=None)
-    lesser = as_lesser(scan, beams=kept, recorded_beams=recorded if told else None)
-    left = elevations_deg(lesser)
+    simpler = degraded(scan, beams=kept, recorded_beams=recorded if told else None)
+    left = elevations_deg(simpler)
     beams = np.unique(np.round(left, 3))
     assert abs(len(beams) - kept) <= 1
     gaps = np.diff(beams)
     assert gaps.max() < 2 * 30 / (kept - 1)
-    assert len(lesser.points) == pytest.approx(len(scan.points) * kept / recorded, rel=0.15)
+    assert len(simpler.points) == pytest.approx(len(scan.points) * kept / recorded, rel=0.15)
 
 
 def test_range_and_blind_rear() -> None:
     scan = spinning(16)
-    near = as_lesser(scan, range_max=30.0)
+    near = degraded(scan, range_max=30.0)
     inside = np.linalg.norm(scan.points, axis=1) <= 30.0
     np.testing.assert_array_equal(near.points, scan.points[inside])
     assert near.ring is not None
     assert near.time_offset is not None
     np.testing.assert_array_equal(near.ring, scan.ring[inside])
     np.testing.assert_array_equal(near.time_offset, scan.time_offset[inside])
-    ahead = as_lesser(scan, blind_rear_deg=120.0)
+    ahead = degraded(scan, blind_rear_deg=120.0)
     azimuth = np.degrees(np.arctan2(ahead.points[:, 1], ahead.points[:, 0]))
     assert np.abs(azimuth).max() < 120.0
     assert len(ahead.points) == pytest.approx(len(scan.points) * 240 / 360, rel=0.01)
-    everything = as_lesser(scan)
+    everything = degraded(scan)
     np.testing.assert_array_equal(everything.points, scan.points)
 
 
@@ -269,14 +269,14 @@ def test_range_and_blind_rear() -> None:
 )
 def test_what_no_lidar_is_is_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(UsageError, match=next(iter(wrong))):
-        as_lesser(spinning(16, columns=9), **wrong)
+        degraded(spinning(16, columns=9), **wrong)
 
 
-def test_the_real_drive_through_a_lesser_lidar(shared_data: logs.Path) -> None:
+def test_the_real_drive_through_a_simpler_lidar(shared_data: logs.Path) -> None:
     log = open_log(shared_data / "kitti_drive" / "drive.mcap")
     for scan in log.scans(0, 52, 17):
-        lesser = as_lesser(scan, beams=16, range_max=30.0, blind_rear_deg=120.0)
-        assert 0.1 < len(lesser.points) / len(scan.points) < 0.2
-        assert np.linalg.norm(lesser.points, axis=1).max() <= 30.0
-        sixteen = as_lesser(scan, beams=16)
+        simpler = degraded(scan, beams=16, range_max=30.0, blind_rear_deg=120.0)
+        assert 0.1 < len(simpler.points) / len(scan.points) < 0.2
+        assert np.linalg.norm(simpler.points, axis=1).max() <= 30.0
+        sixteen = degraded(scan, beams=16)
         assert 0.2 < len(sixteen.points) / len(scan.points) < 0.3

@@ -10,7 +10,7 @@ from tilestream.factors.ghosts import ghosts_among
 from tilestream.factors.observability import whole_places
 from tilestream.factors.surfels import surfel_mm, surfels_in
 from tilestream.factors.virtual_scan import Scene
-from tilestream.formats.logs.mcap import open_log
+from tilestream.formats.logs import open_log
 from tilestream.grid import Box
 from tilestream.kernels.virtual_scan import cast
 from tilestream.pipeline.jobs.simulate import simulate

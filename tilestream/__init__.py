@@ -25,7 +25,7 @@ from tilestream.factors.observability import observability as observability
 from tilestream.factors.sample_points import sample_points as sample_points
 from tilestream.factors.table import factors as factors
 from tilestream.factors.virtual_scan import VirtualSettings as VirtualSettings
-from tilestream.formats.logs.mcap import ScanSelection as ScanSelection
+from tilestream.formats.logs import ScanSelection as ScanSelection
 from tilestream.formats.routes import read_route as read_route
 from tilestream.formats.routes import read_routes as read_routes
 from tilestream.grid import TileKey as TileKey

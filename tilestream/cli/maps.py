@@ -25,7 +25,7 @@ from tilestream.cli.progress import progress
 from tilestream.cli.tables import TILE_CHANGES, diff_table, info_table, plan_table, tile_table
 from tilestream.errors import PartialError
 from tilestream.formats import describe
-from tilestream.formats.logs.mcap import ScanSelection
+from tilestream.formats.logs import ScanSelection
 from tilestream.pipeline.jobs import ingest as ingest_map
 from tilestream.settings import IngestSettings
 from tilestream.store import POINTS, TileStore, open_store

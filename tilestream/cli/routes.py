@@ -43,7 +43,7 @@ from tilestream.errors import PartialError
 from tilestream.factors.catalogue import Which
 from tilestream.factors.rows import samples_by_tile
 from tilestream.factors.virtual_scan import VirtualSettings
-from tilestream.formats.logs.mcap import ScanSelection
+from tilestream.formats.logs import ScanSelection
 from tilestream.pipeline.jobs import along_routes
 from tilestream.pipeline.jobs import localize as localize_drive
 from tilestream.pipeline.stages.drive_scans import Reading

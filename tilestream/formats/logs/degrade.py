@@ -1,4 +1,4 @@
-"""A scan as a lesser lidar would have recorded it: fewer beams, less range, a blind rear."""
+"""A scan degraded to what a simpler lidar records: fewer beams, less range, a blind rear."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ SAME_BEAM_DEG = 0.1
 """Neighbours in a column that are closer than this are of one beam [deg]."""
 
 
-def as_lesser(
+def degraded(
     scan: Scan,
     *,
     beams: int | None = None,
@@ -22,7 +22,7 @@ def as_lesser(
     blind_rear_deg: float | None = None,
     recorded_beams: int | None = None,
 ) -> Scan:
-    """The points of a scan that a lesser lidar would have seen; order and frame stay.
+    """The points of a scan that a simpler lidar would have seen, in their order and frame.
 
     Args:
         scan: a scan of a spinning lidar whose z axis points up and x axis ahead.

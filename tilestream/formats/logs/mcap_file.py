@@ -10,10 +10,9 @@ import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
@@ -23,7 +22,7 @@ from mcap.records import Channel, Chunk, Schema
 from mcap.stream_reader import CRCValidationError, get_chunk_data_stream
 from mcap.summary import Summary
 
-from tilestream.errors import CorruptSourceError, SourceNotFoundError, UnknownFormatError
+from tilestream.errors import CorruptSourceError
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = struct.Struct("<BQ")
@@ -53,8 +52,6 @@ class Message:
 
     topic: str
     """Name of its topic."""
-    log_time: int
-    """When it was recorded [ns]."""
     record: int
     """Offset in the file of the chunk, or of the message outside of chunks, that holds it."""
     start: int
@@ -65,35 +62,27 @@ class Message:
     """Its content."""
 
 
-class McapFile:
+class McapFile(AbstractContextManager["McapFile"]):
     """An MCAP file that is open for reading.
 
     Once messages were read, `lost` says what a cut file lacks (None: nothing), and `unchecked`
     whether some of them lay in records without a CRC, where damage cannot be seen.
 
     Args:
-        path: the file.
+        path: the file, which begins with `MAGIC`.
         topics: False leaves out what only `unpack` does not need: summary and topics.
 
     Raises:
-        SourceNotFoundError: no such file.
-        UnknownFormatError: the file does not begin as an MCAP file does.
+        OSError: there is no such file.
         CorruptSourceError: a checksum fails, or records contradict each other; names file, offset.
     """
 
     def __init__(self, path: str, *, topics: bool = True) -> None:
         self.path = path
-        try:
-            self._stream = Path(path).open("rb")  # noqa: SIM115 - __exit__ closes it
-        except FileNotFoundError:
-            raise SourceNotFoundError(f"{path}: no such file") from None
-        except IsADirectoryError:
-            raise UnknownFormatError(
-                f"{path}: a directory, not an MCAP file; name the .mcap files in it"
-            ) from None
+        self._stream = Path(path).open("rb")  # noqa: SIM115 - __exit__ closes it
         try:
             self.size = self._stream.seek(0, io.SEEK_END)
-            self.whole = self._check_magic()
+            self.whole = self._ends_whole()
             self.lost: str | None = None
             self.unchecked = False
             self._channels: dict[int, tuple[str, str, str]] = {}
@@ -104,15 +93,7 @@ class McapFile:
             self._stream.close()
             raise
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stream.close()
 
     def messages(self, topics: Iterable[str]) -> Iterator[Message]:
@@ -127,14 +108,14 @@ class McapFile:
                     continue
                 if stop - start < MESSAGE_HEAD.size:
                     raise self._corrupt(record, "holds a message shorter than its own head")
-                channel, _, log_time, _ = MESSAGE_HEAD.unpack_from(content, start)
+                channel, *_ = MESSAGE_HEAD.unpack_from(content, start)
                 if channel not in self._channels:
                     raise self._corrupt(record, f"holds a message of the unknown channel {channel}")
                 topic = self._channels[channel][0]
                 if topic in wanted:
                     start += MESSAGE_HEAD.size
                     data = memoryview(content)[start:stop]
-                    yield Message(topic, log_time, record, start, len(content), data)
+                    yield Message(topic, record, start, len(content), data)
 
     def unpack(self, record: int) -> bytes:
         """The records inside the chunk at an offset of the file, or the record itself where a
@@ -143,16 +124,7 @@ class McapFile:
         opcode, content = self._record(record)
         return self._unpacked(record, opcode, content)
 
-    def _check_magic(self) -> bool:
-        head = self._read(0, len(MAGIC))
-        if head != MAGIC[: len(head)]:
-            raise UnknownFormatError(
-                f"{self.path}: not an MCAP file (it begins with {head!r}); rename it or convert it"
-            )
-        if len(head) < len(MAGIC):
-            raise CorruptSourceError(
-                f"{self.path}: cut short after {self.size} bytes; copy it anew"
-            )
+    def _ends_whole(self) -> bool:
         return (
             self.size >= 2 * len(MAGIC) + FOOTER.size
             and self._read(self.size - len(MAGIC), len(MAGIC)) == MAGIC

@@ -5,14 +5,12 @@ texts (or IDL, or none) do not matter.
 """
 
 import struct
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tilestream.errors import CorruptSourceError
-from tilestream.records import Float64
 
 POINT_CLOUD = "sensor_msgs/PointCloud2"
 ODOMETRY = "nav_msgs/Odometry"
@@ -22,11 +20,6 @@ TF = "tf2_msgs/TFMessage"
 
 POINT_FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """sensor_msgs/PointField's datatype -> NumPy type, byte order aside."""
-
-INTENSITY_FIELDS = ("intensity",)
-RING_FIELDS = ("ring", "channel")
-TIME_FIELDS = ("time", "t", "timestamp", "offset_time", "time_stamp")
-LONGEST_SCAN_S = 2.0
 
 
 class Cdr:
@@ -138,10 +131,6 @@ class Cloud:
         shape = (self.height, self.width)
         return np.ndarray(shape, self.dtype, buffer=self.data, strides=strides).reshape(-1)
 
-    def field(self, names: Sequence[str]) -> str | None:
-        """The first of some names that the cloud has."""
-        return next((name for name in names if name in (self.dtype.names or ())), None)
-
 
 def read_cloud(data: memoryview) -> Cloud:
     """The layout of a cloud, checked against its bytes; the points stay packed.
@@ -205,45 +194,3 @@ def _point_type(
             "itemsize": point_step,
         }
     )
-
-
-def positions(rows: NDArray[np.void]) -> Float64:
-    """(n, 3) x, y, z of packed points [m]."""
-    points = np.empty((len(rows), 3))
-    with np.errstate(invalid="ignore"):  # a signalling NaN is a NaN
-        for axis, name in enumerate("xyz"):
-            points[:, axis] = rows[name]
-    return points
-
-
-def returned(points: Float64) -> NDArray[np.bool_]:
-    """(n,) which points (n, 3) are true returns: finite, and not at the lidar's own origin, where
-    several drivers put the pulses that never came back.
-    """
-    sums = points[:, 0] + points[:, 1] + points[:, 2]
-    keep: NDArray[np.bool_] = np.isfinite(sums)
-    maybe_origin = np.flatnonzero(sums == 0.0)
-    keep[maybe_origin] = points[maybe_origin].any(axis=1)
-    return keep
-
-
-def time_offsets(values: NDArray[np.generic], stamp_ns: int) -> Float64 | None:
-    """Per-point times relative to the header [s], from a field as a driver wrote it.
-
-    The rule: the first reading that puts every point within 2 s of the header stamp. Relative to
-    the stamp: integers in ns (Ouster, Livox, Autoware), floats in s (Velodyne). Then since the
-    epoch: s (Hesai, Robosense), ms, us, ns (Livox).
-
-    Returns:
-        (n,) seconds; None where all are 0 (a driver that does not fill the field), some are not
-        finite, or no reading fits (another clock or unit).
-    """
-    if not len(values) or not values.any() or not np.isfinite(values).all():
-        return None
-    integers = np.issubdtype(values.dtype, np.integer)
-    since_stamp = values.astype(np.float64) / (1e9 if integers else 1.0)
-    readings = [since_stamp]
-    readings += [values.astype(np.float64) / unit - stamp_ns / 1e9 for unit in (1.0, 1e3, 1e6)]
-    readings += [(values.astype(np.int64) - stamp_ns) / 1e9] if integers else []
-    readings += [values.astype(np.float64) / 1e9 - stamp_ns / 1e9]
-    return next((r for r in readings if np.abs(r).max() < LONGEST_SCAN_S), None)

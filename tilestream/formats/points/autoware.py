@@ -8,11 +8,12 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
-from tilestream.errors import CorruptSourceError, SourceNotFoundError, UnknownFormatError
+from tilestream.errors import CorruptSourceError, SourceNotFoundError
 from tilestream.formats.base import Block, SourceInfo, Span
-from tilestream.formats.points.pcd import PcdSource, open_pcd
-from tilestream.formats.points.rows import whole_span
+from tilestream.formats.points.pcd import open_pcd
+from tilestream.formats.points.rows import RowSource, whole_span
 from tilestream.formats.projector import METADATA, PROJECTOR, read_projector, read_yaml
+from tilestream.formats.registry import Format
 
 _INSIDE = "pointcloud_map.pcd"
 """The sub-directory into which Autoware puts the PCD files."""
@@ -36,7 +37,7 @@ class MapDirectory:
     """What else a user should know: projector, files that are not listed."""
 
     @cached_property
-    def _parts(self) -> tuple[PcdSource, ...]:
+    def _parts(self) -> tuple[RowSource, ...]:
         return tuple(open_pcd(path) for path in self.files)
 
     @cached_property
@@ -48,12 +49,14 @@ class MapDirectory:
         return SourceInfo(
             path=self.path,
             format="autoware divided map",
-            size_bytes=sum(part.size_bytes for part in self._parts),
+            size_bytes=sum(part.summary.size_bytes for part in self._parts),
             points=self._starts[-1],
             bounds=None,
-            fields=tuple(dict.fromkeys(field for part in self._parts for field in part.fields)),
+            fields=tuple(
+                dict.fromkeys(field for part in self._parts for field in part.summary.fields)
+            ),
             crs=self.crs,
-            resident_bytes=max((part.info().resident_bytes for part in self._parts), default=0),
+            resident_bytes=max((part.summary.resident_bytes for part in self._parts), default=0),
             notes=self.notes,
         )
 
@@ -75,25 +78,14 @@ class MapDirectory:
                 yield from part.blocks(Span(first, last), block_points)
 
 
-def is_map_directory(path: Path) -> bool:
-    """Whether a directory has the metadata of a divided map."""
-    return (path / METADATA).is_file()
-
-
 def open_map_directory(path: str) -> MapDirectory:
     """A divided map; its metadata is read, and every file that it lists is there.
 
     Raises:
-        UnknownFormatError: the directory has no metadata.
         CorruptSourceError: the metadata cannot be read, or names a file outside of the directory.
-        SourceNotFoundError: files that it lists are missing; names them.
+        SourceNotFoundError: the metadata or files that it lists are missing; names them.
     """
     folder = Path(path)
-    if not is_map_directory(folder):
-        raise UnknownFormatError(
-            f"{path}: a directory without {METADATA} is no divided map; give its files, e.g. "
-            f"'{path}/*.pcd'"
-        )
     metadata = folder / METADATA
     content = read_yaml(metadata)
     resolution = (
@@ -120,6 +112,14 @@ def open_map_directory(path: str) -> MapDirectory:
             *_unlisted(folder, set(files)),
         ),
     )
+
+
+FORMAT = Format(
+    name="Autoware's divided map",
+    what="its PCD files, with CRS",
+    open=open_map_directory,
+    marker=METADATA,
+)
 
 
 def _resolution(value: Any, name: str, metadata: Path) -> float:

@@ -12,15 +12,22 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pye57 import libe57
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
-from tilestream.errors import CorruptSourceError
+from tilestream.errors import CorruptSourceError, UnknownFormatError
 from tilestream.formats.base import Block, SourceInfo, Span
-from tilestream.formats.points.rows import finite_block, whole_span
+from tilestream.formats.points.rows import RowSource, finite_block, whole_span
+from tilestream.formats.registry import Format
 from tilestream.kernels.fixed_order import turned
 from tilestream.records import Float64
+
+try:
+    from pye57 import libe57
+except ModuleNotFoundError as missing:
+    if missing.name != "pye57":
+        raise
+    libe57 = None  # the extra is not installed
 
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
@@ -40,37 +47,14 @@ class _Scan:
 
 
 @dataclass(frozen=True)
-class E57Source:
-    """An E57 file; the scans' points in the frame of the file, one scan behind the other."""
+class _Scans:
+    """The scans of a file, one behind the other, in the frame of the file."""
 
     path: str
-    """The file, as it was named."""
     scans: tuple[_Scan, ...]
-    """What each scan's header says."""
-    size_bytes: int
-    """Size of the file [bytes]."""
-    crs: str | None
-    """The CRS in the file's metadata, where pyproj reads it."""
-    notes: tuple[str, ...]
-    """What else a user should know."""
-
-    def info(self) -> SourceInfo:
-        """What the headers of the scans tell."""
-        fields = dict.fromkeys(name for scan in self.scans for name in scan.fields)
-        return SourceInfo(
-            path=self.path,
-            format="e57",
-            size_bytes=self.size_bytes,
-            points=self._count,
-            bounds=None,
-            fields=tuple((name, "number") for name in fields),
-            crs=self.crs,
-            resident_bytes=0,
-            notes=self.notes,
-        )
 
     @property
-    def _count(self) -> int:
+    def count(self) -> int:
         return self.scans[-1].span.stop if self.scans else 0
 
     def spans(self, points: int) -> list[Span]:  # noqa: ARG002  the same for every format
@@ -79,7 +63,7 @@ class E57Source:
 
     def blocks(self, span: Span, block_points: int) -> Iterator[Block]:
         """The points of a span in blocks; see `PointSource.blocks`."""
-        whole_span(span, self._count, self.path)
+        whole_span(span, self.count, self.path)
         with _image(self.path) as image:
             for i, scan in enumerate(self.scans):
                 start, stop = max(span.start, scan.span.start), min(span.stop, scan.span.stop)
@@ -109,13 +93,16 @@ class E57Source:
         reader.close()
 
 
-def open_e57(path: str) -> E57Source:
+def open_e57(path: str) -> RowSource:
     """An E57 file; the headers of its scans are read.
 
     Raises:
+        UnknownFormatError: the extra is not installed.
         CorruptSourceError: the file is cut short or damaged, or a scan has no coordinates that can
             be read, no proper pose, or claims more points than the file holds.
     """
+    if libe57 is None:
+        raise UnknownFormatError(f"{path}: E57 needs an extra: pip install 'tilestream[e57]'")
     size_bytes = Path(path).stat().st_size
     with _image(path) as image, _libe57_errors(path, "its header"):
         root = image.root()
@@ -130,7 +117,29 @@ def open_e57(path: str) -> E57Source:
         f"scan {i} {scan.name!r}: {scan.span.stop - scan.span.start} points"
         for i, scan in enumerate(scans)
     )
-    return E57Source(path, tuple(scans), size_bytes, crs, notes)
+    found = _Scans(path, tuple(scans))
+    names = dict.fromkeys(name for scan in scans for name in scan.fields)
+    summary = SourceInfo(
+        path=path,
+        format="e57",
+        size_bytes=size_bytes,
+        points=found.count,
+        bounds=None,
+        fields=tuple((name, "number") for name in names),
+        crs=crs,
+        resident_bytes=0,
+        notes=notes,
+    )
+    return RowSource(summary, found)
+
+
+FORMAT = Format(
+    name="E57",
+    what="cartesian or spherical scans with their poses (extra `e57`)",
+    open=open_e57,
+    endings=(".e57",),
+    magic=b"ASTM-E57",
+)
 
 
 @contextmanager

@@ -1,4 +1,9 @@
-"""LAS and LAZ (also COPC, which reads as LAZ), the formats of surveyors."""
+"""LAS and LAZ (also COPC, which reads as LAZ), the formats of surveyors.
+
+laspy reads the headers and writes the files. Points are read past it: plain ones as the rows that
+they are, packed ones chunk by chunk with lazrs, whose own seek, on which laspy relies, goes astray
+where chunks differ in size (COPC). What a header claims is checked before either allocates by it.
+"""
 
 import logging
 import math
@@ -22,19 +27,18 @@ from tilestream.formats.base import Block, SourceInfo, Span
 from tilestream.formats.points.rows import (
     BinaryRows,
     Column,
+    RowSource,
     Scaling,
     as_points,
-    even_spans,
     finite_block,
     steps,
     whole_span,
     writing_whole,
 )
+from tilestream.formats.registry import Format
 
 logging.getLogger("laspy").addHandler(logging.NullHandler())  # its errors are raised as ours
 
-MAGIC = b"LASF"
-"""How every LAS and LAZ file begins."""
 _HEADER = struct.Struct("<4s90xHIIBHI")
 """Magic, header size, where the points start, number of VLRs, point format, point size, points."""
 _HEADER_1_4 = struct.Struct("<QIQ")
@@ -62,45 +66,34 @@ class _Chunk:
 
 
 @dataclass(frozen=True)
-class LasSource:
-    """A LAS or LAZ file; a coordinate is stored integer x scale + offset, in float64."""
+class LazRows:
+    """Compressed points: chunks, one behind the other, that the writer chose the size of."""
 
     path: str
-    """The file, as it was named."""
-    rows: BinaryRows
-    """Layout of the points; where they lie in a file that is not compressed."""
+    """The file."""
+    count: int
+    """Number of points that the header claims."""
+    scaling: Scaling
+    """How the stored numbers become metres."""
     chunks: tuple[_Chunk, ...]
-    """The pieces of a compressed file; else empty."""
+    """The pieces that are unpacked by themselves."""
     packing: bytes
-    """How lazrs is told the compression: the record of LAZ in the file's header; else empty."""
+    """How lazrs is told the compression: the record of LAZ in the file's header."""
     dtype: np.dtype[Any]
     """Type of an unpacked point."""
-    summary: SourceInfo
-    """What the header tells."""
-
-    def info(self) -> SourceInfo:
-        """What the header tells."""
-        return self.summary
 
     def spans(self, points: int) -> list[Span]:
-        """Any pieces of LAS; whole chunks of LAZ, at least one (the writer chose their size)."""
-        if not self.chunks:
-            return even_spans(self.rows.count, points)
+        """Whole chunks, at least one each."""
         spans, start = [], 0
         for stop in (chunk.span.stop for chunk in self.chunks):
-            if stop - start >= points or stop == self.rows.count:
+            if stop - start >= points or stop == self.count:
                 spans.append(Span(start, stop))
                 start = stop
         return spans
 
     def blocks(self, span: Span, block_points: int) -> Iterator[Block]:
-        """The points of a span in blocks; see `PointSource.blocks`."""
-        if not self.chunks:
-            return self.rows.blocks(span, block_points)
-        return self._unpacked_blocks(span, block_points)
-
-    def _unpacked_blocks(self, span: Span, block_points: int) -> Iterator[Block]:
-        whole_span(span, self.rows.count, self.path)
+        """The points of a span; see `PointSource.blocks`."""
+        whole_span(span, self.count, self.path)
         with Path(self.path).open("rb") as file:
             for chunk in self.chunks:
                 start, stop = max(span.start, chunk.span.start), min(span.stop, chunk.span.stop)
@@ -109,7 +102,7 @@ class LasSource:
                 points = self._unpack(file, chunk)
                 for step in steps(Span(start, stop), block_points):
                     part = points[step.start - chunk.span.start : step.stop - chunk.span.start]
-                    yield finite_block(part["X"], part["Y"], part["Z"], self.rows.scaling)
+                    yield finite_block(part["X"], part["Y"], part["Z"], self.scaling)
 
     def _unpack(self, file: BinaryIO, chunk: _Chunk) -> NDArray[Any]:
         """A chunk by itself: lazrs' own seek goes astray where chunks differ in size (COPC)."""
@@ -124,8 +117,9 @@ class LasSource:
         return points
 
 
-def open_las(path: str) -> LasSource:
-    """A LAS or LAZ file; its header and chunk table are read and checked against its size.
+def open_las(path: str) -> RowSource:
+    """A LAS or LAZ file; its header and chunk table are read and checked against its size. A
+    coordinate is stored integer x scale + offset, in float64.
 
     Raises:
         CorruptSourceError: the file is too short for what its header claims, or damaged.
@@ -140,14 +134,18 @@ def open_las(path: str) -> LasSource:
             dimensions = list(header.point_format.dimensions)
             dtype = header.point_format.dtype()
         scaling = _scaling(header, path)
-        rows = BinaryRows(path, points_at, point_bytes, count, _XYZ, scaling)
+        plain = BinaryRows(path, points_at, point_bytes, count, _XYZ, scaling)
+        rows: BinaryRows | LazRows = plain
+        resident = 0
         if header.are_points_compressed:
             with _laspy_errors(path, "LAZ record"):
                 packing = bytes(header.vlrs[header.vlrs.index("LasZipVlr")].record_data)
-            chunks = _chunks(file, packing, rows, size_bytes)
+            chunks = _chunks(file, packing, plain, size_bytes)
+            rows = LazRows(path, count, scaling, chunks, packing, dtype)
+            sizes = (c.packed_bytes + point_bytes * (c.span.stop - c.span.start) for c in chunks)
+            resident = max(sizes, default=0)
         else:
-            chunks, packing = (), b""
-            rows.check_size(size_bytes)
+            plain.check_size(size_bytes)
     crs, notes = _crs(header, path)
     lowest, highest = (
         tuple(np.asarray(edge, float).tolist()) for edge in (header.mins, header.maxs)
@@ -160,12 +158,19 @@ def open_las(path: str) -> LasSource:
         bounds=(lowest, highest) if count else None,
         fields=tuple((d.name, f"{d.num_bits} bit {d.kind.name}") for d in dimensions),
         crs=crs,
-        resident_bytes=max(
-            (c.packed_bytes + point_bytes * (c.span.stop - c.span.start) for c in chunks), default=0
-        ),
+        resident_bytes=resident,
         notes=notes,
     )
-    return LasSource(path, rows, chunks, packing, dtype, summary)
+    return RowSource(summary, rows)
+
+
+FORMAT = Format(
+    name="LAS",
+    what="1.0 to 1.4, LAZ and COPC, with CRS",
+    open=open_las,
+    endings=(".las", ".laz"),
+    magic=b"LASF",
+)
 
 
 @contextmanager

@@ -1,9 +1,15 @@
-"""PCD, the point clouds of PCL and Autoware: ascii, binary and binary_compressed."""
+"""PCD, the point clouds of PCL and Autoware: ascii, binary and binary_compressed.
+
+Open3D, the one dependency that reads PCD too, holds a whole file at once, reads coordinates in
+float64 as zeros, and a file that is cut short as an empty cloud (0.20). No dependency brings LZF,
+the compression of the third encoding: it is a kernel (`kernels/lzf.py`).
+"""
 
 import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
@@ -14,11 +20,12 @@ from tilestream.errors import CorruptSourceError, UsageError
 from tilestream.formats.base import Block, SourceInfo, Span
 from tilestream.formats.points.rows import (
     BinaryRows,
-    Column,
     Columns,
+    RowSource,
     TextRows,
     as_points,
     as_text,
+    columns_of,
     even_spans,
     finite_block,
     steps,
@@ -27,6 +34,7 @@ from tilestream.formats.points.rows import (
     writing_whole,
 )
 from tilestream.formats.projector import crs_beside
+from tilestream.formats.registry import Format
 from tilestream.kernels import lzf
 
 _KEYWORDS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS")
@@ -51,87 +59,58 @@ def looks_like_pcd(head: bytes) -> bool:
 
 
 @dataclass(frozen=True)
-class PcdSource:
-    """A PCD file.
-
-    VIEWPOINT is where the sensor stood: it is not applied to the coordinates (nor does PCL).
-    Coordinates may be of any numeric type; float64 ones arrive exactly.
-    """
+class CompressedRows:
+    """The points of binary_compressed: all x stand first, then all y, …, compressed together."""
 
     path: str
-    """The file, as it was named."""
-    encoding: Encoding
-    """How its points are written."""
-    fields: tuple[tuple[str, str], ...]
-    """Name and type of every field."""
-    rows: BinaryRows | TextRows
-    """Where the points lie: the layout of the decoded rows for binary_compressed."""
-    size_bytes: int
-    """Size of the file [bytes]."""
-    packed_bytes: int = 0
-    """Size of the compressed points of binary_compressed [bytes]; else 0."""
-    unpacked_bytes: int = 0
-    """Size of the decoded points of binary_compressed [bytes]; else 0."""
-    crs: str | None = None
-    """CRS of x and y where an Autoware map's `map_projector_info.yaml` beside the file tells it."""
-    notes: tuple[str, ...] = ()
-    """What else a user should know."""
-
-    def info(self) -> SourceInfo:
-        """What the header tells."""
-        return SourceInfo(
-            path=self.path,
-            format=f"pcd {self.encoding}",
-            size_bytes=self.size_bytes,
-            points=self.rows.count,
-            bounds=None,
-            fields=self.fields,
-            crs=self.crs,
-            resident_bytes=self.packed_bytes + self.unpacked_bytes,
-            notes=self.notes,
-        )
+    """The file."""
+    offset: int
+    """Where the compressed bytes start [bytes]."""
+    count: int
+    """Number of points that the header claims."""
+    columns: Columns
+    """Where x, y and z lie in a row, were the points rows."""
+    packed_bytes: int
+    """Size of the compressed points [bytes]."""
+    unpacked_bytes: int
+    """Size of the decoded points [bytes]."""
 
     def spans(self, points: int) -> list[Span]:
-        """Any pieces of a binary file; the other two are read from the beginning: one span."""
-        count = self.rows.count
-        return even_spans(count, points if self.encoding == "binary" else max(count, points))
+        """One: the points are decoded all together."""
+        return even_spans(self.count, max(self.count, points))
 
     def blocks(self, span: Span, block_points: int) -> Iterator[Block]:
-        """The points of a span in blocks; see `PointSource.blocks`."""
-        if self.encoding != "binary_compressed":
-            return self.rows.blocks(span, block_points)
-        return self._unpacked_blocks(span, block_points)
-
-    def _unpacked_blocks(self, span: Span, block_points: int) -> Iterator[Block]:
-        """All x stand first, then all y, …: each field is a column of the decoded bytes."""
-        rows = self.rows
-        whole_span(span, rows.count, self.path)
+        """The points of a span; see `PointSource.blocks`."""
+        whole_span(span, self.count, self.path)
         unpacked = self._unpack()
         x, y, z = (
-            np.ndarray((rows.count,), c.dtype, unpacked.data, c.offset * rows.count)
-            for c in rows.columns
+            np.ndarray((self.count,), c.dtype, unpacked.data, c.offset * self.count)
+            for c in self.columns
         )
         for step in steps(span, block_points):
             part = slice(step.start, step.stop)
             yield finite_block(x[part], y[part], z[part])
 
     def _unpack(self) -> NDArray[np.uint8]:
-        data = self.rows.offset + 2 * _TWO_SIZES.itemsize
         with Path(self.path).open("rb") as file:
-            file.seek(data)
+            file.seek(self.offset)
             packed = np.fromfile(file, np.uint8, self.packed_bytes)
         unpacked = np.empty(self.unpacked_bytes, np.uint8)
         damaged = lzf.decompress(packed, unpacked)
         if damaged != lzf.WHOLE:
             raise CorruptSourceError(
-                f"{self.path}: the compressed points are damaged at offset {data + damaged}: "
-                "copy the file again from where it came from"
+                f"{self.path}: the compressed points are damaged at offset "
+                f"{self.offset + damaged}: copy the file again from where it came from"
             )
         return unpacked
 
 
-def open_pcd(path: str) -> PcdSource:
+def open_pcd(path: str) -> RowSource:
     """A PCD file; its header is read and checked against the size of the file.
+
+    VIEWPOINT is where the sensor stood: it is not applied to the coordinates (nor does PCL).
+    Coordinates may be of any numeric type; float64 ones arrive exactly. The CRS is that of an
+    Autoware map, where its `map_projector_info.yaml` is beside the file.
 
     Raises:
         CorruptSourceError: the header is incomplete, contradicts itself, names a type that PCD
@@ -142,26 +121,56 @@ def open_pcd(path: str) -> PcdSource:
         size_bytes = os.fstat(file.fileno()).st_size
         encoding = _encoding(header, path)
         layout = _Layout(header, path)
-        if encoding == "binary_compressed":
-            file.seek(offset)
-            sizes = np.frombuffer(file.read(2 * _TWO_SIZES.itemsize), np.uint8)
-            packed, unpacked = _compressed_sizes(sizes, layout, offset, size_bytes, path)
-            end = offset + 2 * _TWO_SIZES.itemsize + packed
-        else:
-            packed, unpacked, end = 0, 0, offset + layout.size * layout.count
+        rows = _rows(file, encoding, layout, offset, size_bytes, path)
+    resident, end = 0, size_bytes
+    if isinstance(rows, CompressedRows):
+        resident, end = rows.packed_bytes + rows.unpacked_bytes, rows.offset + rows.packed_bytes
+    elif isinstance(rows, BinaryRows):
+        end = offset + layout.size * layout.count
+    crs, notes = crs_beside(Path(path))
+    if size_bytes > end:
+        notes += (f"{size_bytes - end} bytes behind the last point are ignored",)
+    summary = SourceInfo(
+        path=path,
+        format=f"pcd {encoding}",
+        size_bytes=size_bytes,
+        points=layout.count,
+        bounds=None,
+        fields=layout.fields,
+        crs=crs,
+        resident_bytes=resident,
+        notes=notes,
+    )
+    return RowSource(summary, rows)
+
+
+def _rows(
+    file: BinaryIO, encoding: Encoding, layout: "_Layout", offset: int, size_bytes: int, path: str
+) -> BinaryRows | TextRows | CompressedRows:
+    """Where the points lie, within the size of the file."""
+    if encoding == "binary_compressed":
+        file.seek(offset)
+        data = offset + 2 * _TWO_SIZES.itemsize
+        sizes = np.frombuffer(file.read(2 * _TWO_SIZES.itemsize), np.uint8)
+        packed, unpacked = _compressed_sizes(sizes, layout, offset, size_bytes, path)
+        return CompressedRows(path, data, layout.count, layout.columns, packed, unpacked)
+    rows: BinaryRows | TextRows
     if encoding == "ascii":
-        rows: BinaryRows | TextRows = TextRows(
-            path, offset, layout.words, layout.count, layout.text_columns
-        )
+        rows = TextRows(path, offset, layout.words, layout.count, layout.text_columns)
     else:
         rows = BinaryRows(path, offset, layout.size, layout.count, layout.columns)
-    if encoding != "binary_compressed":
-        rows.check_size(size_bytes)
-    left = size_bytes - end if encoding != "ascii" else 0
-    crs, notes = crs_beside(Path(path))
-    if left > 0:
-        notes += (f"{left} bytes behind the last point are ignored",)
-    return PcdSource(path, encoding, layout.fields, rows, size_bytes, packed, unpacked, crs, notes)
+    rows.check_size(size_bytes)
+    return rows
+
+
+FORMAT = Format(
+    name="PCD",
+    what="ascii, binary, binary_compressed",
+    open=open_pcd,
+    endings=(".pcd",),
+    magic=b"# .PCD",
+    recognise=looks_like_pcd,
+)
 
 
 def _read_header(file: BinaryIO, path: str) -> tuple[dict[str, list[str]], int]:
@@ -252,21 +261,14 @@ class _Layout:
     def _columns(
         self, names: list[str], types: list[np.dtype[Any]], counts: list[int], widths: list[int]
     ) -> Columns:
-        def column(name: str) -> Column:
-            if names.count(name) != 1:
-                raise CorruptSourceError(
-                    f"{self._path}: has {names.count(name)} fields {name!r} among "
-                    f"{' '.join(names)}; points need x, y and z"
-                )
-            i = names.index(name)
-            if counts[i] != 1:
-                raise CorruptSourceError(
-                    f"{self._path}: field {name!r} has COUNT {counts[i]}; a coordinate has 1"
-                )
-            before = zip(widths[:i], counts[:i], strict=True)
-            return Column(sum(width * n for width, n in before), types[i])
-
-        return column("x"), column("y"), column("z")
+        many = [name for name, n in zip(names, counts, strict=True) if n != 1 and name in "xyz"]
+        if many:
+            raise CorruptSourceError(
+                f"{self._path}: field {many[0]!r} has COUNT {counts[names.index(many[0])]}; a "
+                "coordinate has 1"
+            )
+        ends = accumulate(width * n for width, n in zip(widths, counts, strict=True))
+        return columns_of(names, [0, *ends], types, self._path)
 
     def _points(self) -> int:
         """POINTS, or WIDTH x HEIGHT where an old file lacks it; both must agree."""

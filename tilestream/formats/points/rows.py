@@ -2,19 +2,19 @@
 
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice, pairwise
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from tilestream.errors import CorruptSourceError, UsageError
-from tilestream.formats.base import Block, Span
+from tilestream.formats.base import Block, SourceInfo, Span
 from tilestream.kernels.rows import finite_points
 from tilestream.records import Float64
 
@@ -36,6 +36,74 @@ class Column:
 
 Columns = tuple[Column, Column, Column]
 """x, y and z."""
+
+
+def columns_of(
+    names: Sequence[str], places: Sequence[int], types: Sequence[np.dtype[Any]], path: str
+) -> Columns:
+    """Where x, y and z lie among the fields of a row.
+
+    Args:
+        names: name of each field.
+        places: its `Column.offset`.
+        types: its type, with byte order.
+        path: the file, for messages.
+
+    Raises:
+        CorruptSourceError: one of x, y, z is missing or there twice.
+    """
+
+    def column(name: str) -> Column:
+        if names.count(name) != 1:
+            raise CorruptSourceError(
+                f"{path}: has {names.count(name)} fields {name!r} among {' '.join(names)}; points "
+                "need x, y and z"
+            )
+        i = names.index(name)
+        return Column(places[i], types[i])
+
+    return column("x"), column("y"), column("z")
+
+
+class Rows(Protocol):
+    """The points of a file, once its header is read."""
+
+    @property
+    def count(self) -> int:
+        """Number of points that the header claims."""
+
+    def spans(self, points: int) -> list[Span]:
+        """Pieces of about `points` points; see `PointSource.spans`."""
+
+    def blocks(self, span: Span, block_points: int) -> Iterator[Block]:
+        """The points of a span; see `PointSource.blocks`."""
+
+
+@dataclass(frozen=True)
+class RowSource:
+    """A `PointSource` whose header says all but the points."""
+
+    summary: SourceInfo
+    """What the header tells."""
+    rows: Rows
+    """The points."""
+
+    @property
+    def path(self) -> str:
+        """The file, as it was named."""
+        return self.summary.path
+
+    def info(self) -> SourceInfo:
+        """What the header tells."""
+        return self.summary
+
+    def spans(self, points: int) -> list[Span]:
+        """The file in pieces; see `PointSource.spans`."""
+        return self.rows.spans(points)
+
+    def blocks(self, span: Span, block_points: int) -> Iterator[Block]:
+        """The points of a span in blocks; see `PointSource.blocks`."""
+        return self.rows.blocks(span, block_points)
 
 
 def even_spans(count: int, points: int) -> list[Span]:
@@ -111,6 +179,10 @@ class BinaryRows:
     scaling: Scaling = METRES
     """How the stored numbers become metres."""
 
+    def spans(self, points: int) -> list[Span]:
+        """Any pieces, of equal size."""
+        return even_spans(self.count, points)
+
     def check_size(self, file_bytes: int) -> None:
         """Refuse a file that is too short for the rows that it claims."""
         needed = self.offset + self.size * self.count
@@ -164,6 +236,10 @@ class TextRows:
     """Which words are x, y and z."""
     more_follows: bool = False
     """Whether something else may come behind the last row."""
+
+    def spans(self, points: int) -> list[Span]:
+        """One: text is read from its beginning."""
+        return even_spans(self.count, max(self.count, points))
 
     def check_size(self, file_bytes: int) -> None:
         """Refuse a file that is too short for the rows that it claims, two bytes a number."""

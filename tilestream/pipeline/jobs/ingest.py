@@ -19,7 +19,8 @@ from tilestream.errors import (
 )
 from tilestream.formats import expand_sources, open_source
 from tilestream.formats.base import SourceInfo, Span
-from tilestream.formats.logs.mcap import ScanSelection
+from tilestream.formats.logs import ScanSelection, is_log
+from tilestream.formats.registry import state_of
 from tilestream.marks import hash_of
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.executor import Watch, execute
@@ -307,7 +308,7 @@ def _examine_all(
             found[pattern] = Source(pattern, state="", reason=str(error))
             continue
         for path in paths:
-            options = log_options if path.lower().endswith(".mcap") else {}
+            options = log_options if is_log(path) else {}
             absolute = str(Path(path).absolute())
             found.setdefault(absolute, _examine(absolute, options))
     if not found:
@@ -317,9 +318,8 @@ def _examine_all(
 
 def _examine(path: str, options: dict[str, Any]) -> Source:
     """Open a source as far as its header; a failure is its reason, not an exception."""
-    stat = Path(path).stat()
     readable = tuple(sorted(options.items()))
-    known = Source(path, hash_of(stat.st_size, stat.st_mtime_ns, repr(readable)), options=readable)
+    known = Source(path, hash_of(*state_of(path), repr(readable)), options=readable)
     try:
         source = open_source(path, **options)
         info = source.info()

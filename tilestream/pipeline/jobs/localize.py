@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from tilestream.errors import PartialError, TileNotReadyError, UsageError
-from tilestream.formats.logs.mcap import ScanLog, ScanSelection
+from tilestream.formats.logs import ScanLog, ScanSelection
 from tilestream.grid import Box, TileKey, whole_mm
 from tilestream.kernels.fixed_order import norms
 from tilestream.label import start_poses
@@ -58,7 +58,7 @@ def localize(
 
     Args:
         store: the map.
-        log: an MCAP log with point clouds and poses.
+        log: a log with point clouds and poses, of any format (`formats.logs`).
         out: folder of the tables: `errors/` (a row per sample point), `starts/` (a row per start),
             a local path or any fsspec URL.
         cell_size: edge of an NDT cell [m].
@@ -67,7 +67,7 @@ def localize(
         starts: the starts; default the paper's 317.
         true_pose: `log`, or `refined` as the paper does.
         scans: which scans to use; default all.
-        reading: how the log is read (topics, as if by a lesser sensor); its path is `log`.
+        reading: how the log is read (topics, as if by a simpler sensor); its path is `log`.
         starts_per_task: splits the starts of a slice over several tasks; None: all in one.
         client: a Dask client to run on; None: this process.
         memory: what a task may use [bytes].

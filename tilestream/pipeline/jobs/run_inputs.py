@@ -8,7 +8,7 @@ from typing import Any
 
 from tilestream.errors import ModelError, SourceNotFoundError, UsageError
 from tilestream.factors.virtual_scan import VirtualSettings
-from tilestream.formats.logs.mcap import ScanSelection
+from tilestream.formats.logs import ScanSelection, is_log
 from tilestream.formats.routes import read_routes
 from tilestream.model.dataset import made_with
 from tilestream.model.model_file import load_model
@@ -170,7 +170,7 @@ def ingest_settings(settings: RunSettings) -> IngestSettings:
 
 def map_scans(settings: RunSettings, inputs: Inputs) -> ScanSelection | None:
     """Which scans of logs become the map; None: there are no logs among the sources."""
-    if any(source.lower().endswith(".mcap") for source in inputs.sources):
+    if any(map(is_log, inputs.sources)):
         return ScanSelection(every=settings.map.every, offset=settings.map.offset)
     return None
 

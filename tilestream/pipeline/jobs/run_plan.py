@@ -6,7 +6,7 @@ from typing import Any
 from tilestream.factors import catalogue
 from tilestream.factors.rows import samples_by_tile
 from tilestream.factors.virtual_drive import NEIGHBOURS
-from tilestream.formats.logs.mcap import ScanSelection
+from tilestream.formats.logs import ScanSelection
 from tilestream.grid import MM_PER_M, TileGrid, TileKey
 from tilestream.model.dataset import TARGETS, features_of
 from tilestream.model.evaluation import factor_sets

@@ -62,7 +62,7 @@ class MapSettings(IngestSettings):
 
 
 class DriveSettings(Settings):
-    """A log on which errors are measured, maybe through a lesser sensor."""
+    """A log on which errors are measured, maybe through a simpler sensor."""
 
     log: str
     """An MCAP log with point clouds and poses."""

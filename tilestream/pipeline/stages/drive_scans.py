@@ -4,14 +4,14 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 
 from tilestream.errors import UsageError
-from tilestream.formats.logs.degrade import as_lesser
+from tilestream.formats.logs import ScanLog, open_log
+from tilestream.formats.logs.degrade import degraded
 from tilestream.formats.logs.deskew import Sweep, deskew
-from tilestream.formats.logs.mcap import ScanLog, open_log
+from tilestream.formats.registry import state_of
 from tilestream.marks import hash_of
 from tilestream.pipeline.engine.stage import Counts
 from tilestream.records import Scan
@@ -55,15 +55,14 @@ class Reading:
         Raises:
             UsageError: a number outside of its range.
         """
-        self._lesser(Scan(0, np.zeros((0, 3))))
+        self._degraded(Scan(0, np.zeros((0, 3))))
         if self.sweep_s is not None and not 0.0 < self.sweep_s < math.inf:
             raise UsageError(f"sweep is {self.sweep_s!r}: give a positive time in seconds")
 
     @property
     def state(self) -> str:
-        """Hash of the file as it is now, and of how it is read."""
-        stat = Path(self.path).stat()
-        return hash_of(self, stat.st_size, stat.st_mtime_ns)
+        """Hash of the log as it is now, and of how it is read."""
+        return hash_of(self, *state_of(self.path))
 
     def open(self) -> ScanLog:
         """The log."""
@@ -74,10 +73,10 @@ class Reading:
         if self.deskew:
             sweep = None if self.sweep_s is None else Sweep(self.sweep_s)
             scan = deskew(scan, log.trajectory, sweep=sweep)
-        return self._lesser(scan)
+        return self._degraded(scan)
 
-    def _lesser(self, scan: Scan) -> Scan:
-        return as_lesser(
+    def _degraded(self, scan: Scan) -> Scan:
+        return degraded(
             scan,
             beams=self.beams,
             range_max=self.range_max,

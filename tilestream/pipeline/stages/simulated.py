@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tilestream.formats.logs.mcap_write import write_log
+from tilestream.formats.logs import write_log
 from tilestream.formats.points.las import write_las
 from tilestream.formats.points.rows import writing_whole
 from tilestream.marks import hash_of

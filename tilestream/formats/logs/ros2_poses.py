@@ -7,6 +7,7 @@ import numpy as np
 
 from tilestream.errors import PoseError
 from tilestream.formats.logs import ros2
+from tilestream.formats.logs.base import LogOptions
 from tilestream.formats.logs.poses import Edge, compose, trajectory
 from tilestream.records import Float64, Int64, Trajectory
 
@@ -58,21 +59,19 @@ def choose_poses(
     path: str,
     tracks: list[PoseTrack],
     lidar_frame: str,
-    named: str | None,
-    map_frame: str | None,
-    pose_frame: str | None,
-    max_gap_s: float,
+    options: LogOptions,
     notes: list[str],
 ) -> tuple[str, Trajectory]:
-    """Topic and poses of the lidar; see `mcap.open_log` for the rules. Notes what was assumed.
+    """Topic and poses of the lidar; see `mcap.open_mcap` for the rules. Notes what was assumed.
 
     Raises:
         PoseError: no poses, several topics that are equally good, or no way to the lidar.
     """
+    named, pose_frame = options.pose_topic, options.pose_frame
     topics = [t for t in tracks if t.type in POSE_TYPES and t.count]
     tf = [t for t in tracks if t.type == ros2.TF]
     if named is None and topics:
-        topic = _best(path, topics, map_frame or "map", notes)
+        topic = _best(path, topics, options.map_frame or "map", notes)
         return topic.topic, _from_topic(path, topic, tf, lidar_frame, pose_frame, notes)
     for topic in topics:
         if topic.topic == named:
@@ -83,7 +82,7 @@ def choose_poses(
             f"{path}: no poses; a log needs {ros2.ODOMETRY}, {ros2.POSE}, {ros2.POSE_COVARIANCE} "
             f"or {ros2.TF} messages" + (f" on {named}" if named else "")
         )
-    return named or moving[0].topic, _from_tf(path, tf, lidar_frame, map_frame, max_gap_s, notes)
+    return named or moving[0].topic, _from_tf(path, tf, lidar_frame, options, notes)
 
 
 def _best(path: str, topics: list[PoseTrack], map_frame: str, notes: list[str]) -> PoseTrack:
@@ -143,8 +142,7 @@ def _from_tf(
     path: str,
     tf: list[PoseTrack],
     lidar_frame: str,
-    map_frame: str | None,
-    max_gap_s: float,
+    options: LogOptions,
     notes: list[str],
 ) -> Trajectory:
     edges: dict[Edge, Trajectory] = {}
@@ -154,8 +152,9 @@ def _from_tf(
             name = f"{track.topic} ({edge[0]} -> {edge[1]})"
             _note_unusable(path, name, edges[edge], unusable, notes)
     frames = {frame for edge in edges for frame in edge}
-    map_frame = map_frame or ("map" if "map" in frames else _root(edges, lidar_frame))
-    poses = compose(edges, map_frame, lidar_frame, max_gap_s)
+    root = "map" if "map" in frames else _root(edges, lidar_frame)
+    map_frame = options.map_frame or root
+    poses = compose(edges, map_frame, lidar_frame, options.max_gap_s)
     if poses is None:
         raise PoseError(
             f"{path}: tf does not lead from {map_frame!r} to the lidar's frame {lidar_frame!r}; "

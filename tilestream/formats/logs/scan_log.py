@@ -1,0 +1,154 @@
+"""The scans of a log with the pose of the lidar at each, whatever the format."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tilestream.errors import CorruptSourceError, PoseError, SourceNotFoundError
+from tilestream.formats.base import SourceInfo
+from tilestream.formats.logs.base import RecordedScan, Recording
+from tilestream.formats.logs.drivers import returned, time_offsets
+from tilestream.formats.logs.poses import PoseStatus, interpolate
+from tilestream.kernels.fixed_order import norms
+from tilestream.records import Float64, Int64, Scan
+
+_BYTES_PER_POINT = 80
+"""What the columns of a scan that is read take [bytes per point]."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScanLog(Recording):
+    """The scans of a log and where the lidar was, opened by `open_log`. A value: it holds no open
+    file and can be sent to another process, which then need not read the log through again.
+    """
+
+    T_map_lidar: Float64
+    """(k, 4, 4) pose of the lidar at each scan's stamp; NaN where it has none."""
+    pose_status: NDArray[np.int8]
+    """(k,) `PoseStatus`: POSED, or why the scan is skipped."""
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @property
+    def posed(self) -> NDArray[np.bool_]:
+        """(k,) which scans have a pose."""
+        return np.equal(self.pose_status, PoseStatus.POSED)
+
+    def scans(self, start: int = 0, stop: int | None = None, step: int = 1) -> Iterator[Scan]:
+        """The posed scans of a slice of the log, by index in order of their stamps.
+
+        Scans without a pose are left out (`pose_status` says why); points that are no returns are
+        left out and counted in `Scan.dropped`.
+
+        Raises:
+            CorruptSourceError: the log is damaged, or is not the one that was opened.
+            SourceNotFoundError: it is no longer there.
+        """
+        return self.scans_at(np.arange(len(self))[start:stop:step])
+
+    def scans_at(self, indices: Iterable[int] | Int64) -> Iterator[Scan]:
+        """As `scans`, for any scans by index, e.g. of a `ScanSelection`."""
+        wanted = [int(i) for i in indices if self.pose_status[i] == PoseStatus.POSED]
+        for index, recorded in zip(wanted, self.recorded_at(wanted), strict=True):
+            yield _scan(recorded, self.T_map_lidar[index])
+
+    def recorded_at(self, indices: list[int]) -> Iterator[RecordedScan]:
+        """Some scans as they were recorded, posed or not; errors as for `scans`."""
+        changed = f"{self.path}: has changed since it was opened; open it again"
+        try:
+            for index, recorded in zip(indices, self.reader.read(indices), strict=True):
+                if recorded.stamp_ns != self.stamps_ns[index]:
+                    raise CorruptSourceError(changed)
+                yield recorded
+        except FileNotFoundError as error:
+            raise SourceNotFoundError(f"{changed} ({error})") from error
+
+    def info(self, indices: Int64 | None = None) -> SourceInfo:
+        """What is in the log; of the scans, those given by index (default: all)."""
+        used = np.arange(len(self)) if indices is None else indices
+        posed = used[self.posed[used]]
+        path_m = norms(np.diff(self.T_map_lidar[posed, :3, 3], axis=0)).sum()
+        stamps = self.stamps_ns[used]
+        duration_s = (stamps[-1] - stamps[0]) / 1e9 if len(stamps) else 0.0
+        largest_scan = int(self.point_counts[used].max(initial=0))
+        return SourceInfo(
+            path=self.path,
+            format=self.format,
+            size_bytes=self.size_bytes,
+            points=int(self.point_counts[posed].sum()),
+            bounds=None,
+            fields=self.fields,
+            crs=None,
+            resident_bytes=int(self.held_bytes[used].max(initial=0))
+            + _BYTES_PER_POINT * largest_scan,
+            notes=(
+                *self.contents,
+                (
+                    f"{len(used)} scans of {self.points_topic} over {duration_s:.1f} s, "
+                    f"{len(posed)} with a pose from {self.pose_topic}, along {path_m:.1f} m"
+                ),
+                *self.notes,
+            ),
+        )
+
+
+def with_poses(found: Recording, max_gap_s: float) -> ScanLog:
+    """The scans of a log with their poses, interpolated over at most `max_gap_s` [s]. Scans without
+    a pose are noted.
+
+    Raises:
+        PoseError: no scan has a pose.
+    """
+    T_map_lidar, status = interpolate(found.trajectory, found.stamps_ns, max_gap_s)
+    notes = (*found.notes, *_skipped(found, status, max_gap_s))
+    known = {**vars(found), "notes": notes}
+    return ScanLog(**known, T_map_lidar=T_map_lidar, pose_status=status)
+
+
+def _skipped(found: Recording, status: NDArray[np.int8], max_gap_s: float) -> list[str]:
+    """A note for each reason for which scans have no pose."""
+    reasons = {
+        PoseStatus.BEFORE: "before the first pose",
+        PoseStatus.AFTER: "after the last pose",
+        PoseStatus.GAP: f"where poses are more than {max_gap_s:g} s apart",
+    }
+    if not (status == PoseStatus.POSED).any():
+        scans, poses = found.stamps_ns / 1e9, found.trajectory.stamps_ns / 1e9
+        raise PoseError(
+            f"{found.path}: none of the {len(scans)} scans has a pose: scans are from "
+            f"{scans[0]:.3f} to {scans[-1]:.3f} s, poses from {poses[0]:.3f} to {poses[-1]:.3f} s, "
+            f"and none is interpolated over more than {max_gap_s:g} s; are these the same clock?"
+        )
+    counts = {why: int((status == code).sum()) for code, why in reasons.items()}
+    return [f"{n} of {len(status)} scans skipped: {why}" for why, n in counts.items() if n]
+
+
+def _scan(recorded: RecordedScan, T_map_lidar: Float64) -> Scan:
+    """The returns of a recorded scan, in the types that every scan has."""
+    keep = kept(returned(recorded.points))
+    points, time = recorded.points[keep], recorded.time
+    return Scan(
+        stamp_ns=recorded.stamp_ns,
+        points=points,
+        T_map_lidar=T_map_lidar,
+        intensity=(
+            None if recorded.intensity is None else recorded.intensity[keep].astype(np.float32)
+        ),
+        ring=None if recorded.ring is None else recorded.ring[keep].astype(np.int32),
+        time_offset=(
+            None if time is None else time_offsets(_native(time[keep]), recorded.stamp_ns)
+        ),
+        dropped=len(recorded.points) - len(points),
+    )
+
+
+def kept(keep: NDArray[np.bool_]) -> NDArray[np.bool_] | slice:
+    """What to index with: a slice, which copies nothing, where all points stay."""
+    return slice(None) if keep.all() else keep
+
+
+def _native(values: NDArray[np.generic]) -> NDArray[np.generic]:
+    return values.astype(values.dtype.newbyteorder("="))

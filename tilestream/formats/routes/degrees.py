@@ -1,0 +1,69 @@
+"""Coordinates in degrees: how they are told from metres, and their projection."""
+
+import numpy as np
+from pyproj import CRS, Transformer
+from pyproj.exceptions import CRSError
+
+from tilestream.errors import CrsError
+from tilestream.kernels.fixed_order import norms
+from tilestream.records import Float64
+
+
+def metric(
+    path: str, points: list[Float64], crs: str | None, project_to: str | None, drawn: bool
+) -> list[Float64]:
+    """The points of each path of a file in metres: as they are, or projected from degrees.
+
+    Args:
+        path: the file, for messages.
+        points: (n, 3) points of each path, as the file gives them.
+        crs: coordinate reference system of the file; None: it does not say.
+        project_to: CRS to project degrees to.
+        drawn: whether the paths were drawn, not recorded: their points do not lie close together.
+
+    Returns:
+        (n, 3) points of each path [m].
+
+    Raises:
+        CrsError: degrees without `project_to`, metres with it, or a CRS that cannot be used.
+    """
+    system, target = _crs(path, crs), _crs(path, project_to)
+    if target is not None and target.is_geographic:
+        raise CrsError(f"{path}: project_to = {project_to!r} is in degrees; name a metric CRS")
+    degrees = system.is_geographic if system is not None else _look_like_degrees(points, drawn)
+    if not degrees:
+        if project_to is not None:
+            raise CrsError(f"{path}: is not in degrees, so it cannot be projected to {project_to}")
+        return points
+    if target is None:
+        raise CrsError(
+            f"{path}: coordinates in degrees, not metres (or a path of less than a metre); project "
+            "them to the map's CRS first, or name it as project_to"
+        )
+    to_map = Transformer.from_crs(system or CRS.from_epsg(4326), target, always_xy=True)
+    projected = []
+    for xyz in points:
+        x, y = to_map.transform(xyz[:, 0], xyz[:, 1])
+        projected.append(np.column_stack([x, y, xyz[:, 2]]))
+    return projected
+
+
+def _crs(path: str, name: str | None) -> CRS | None:
+    try:
+        return None if name is None else CRS.from_user_input(name)
+    except CRSError as error:
+        raise CrsError(f"{path}: {name!r} is no CRS that pyproj knows ({error})") from error
+
+
+def _look_like_degrees(points: list[Float64], drawn: bool) -> bool:
+    every = np.concatenate(points)[:, :2]
+    every = every[np.isfinite(every).all(axis=1)]
+    if len(every) < 2:
+        return False
+    largest = np.abs(every).max(axis=0)
+    if largest.min() > 90 or largest.max() > 180:
+        return False
+    steps = np.concatenate([norms(np.diff(xyz[:, :2], axis=0)) for xyz in points])
+    steps = steps[steps > 0]
+    extent = np.ptp(every, axis=0).max()
+    return bool(extent > 0 and (extent < 1.0 or (drawn and np.median(steps) < 1e-3)))
