@@ -9,9 +9,10 @@ from scenes import PLACES
 
 import tilestream as ts
 from tilestream.factors.surfels import surfel_mm, surfels_in
-from tilestream.factors.virtual_scan import Beams, Scene, VirtualSettings, virtual_scan
+from tilestream.factors.virtual_scan import Beams, Scene, virtual_scan
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.grid import Box
+from tilestream.settings import VirtualSettings
 
 
 def figures(folder: Path) -> dict[str, NDArray[np.float64]]:

@@ -11,9 +11,10 @@ import tilestream
 ROOT = Path(tilestream.__file__).parent
 FLOORS = (
     ("errors", "version"),
-    ("grid", "settings", "marks"),
+    ("config", "grid", "marks"),
     ("kernels", "sensor"),
     ("records",),
+    ("settings",),
     ("ndt",),
     ("store", "tables", "formats", "simulation"),
     ("registration",),

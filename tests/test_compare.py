@@ -18,13 +18,13 @@ import tilestream as ts
 from tilestream.apps.compare import Choice, choices_of, compare, plan_compare
 from tilestream.cli import run
 from tilestream.errors import UsageError
-from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.formats.routes import route_of
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY
 from tilestream.pipeline.jobs.along_routes import observe_along
 from tilestream.report import write_comparison
 from tilestream.report.comparison import CELL_BYTES, Comparison
+from tilestream.settings import VirtualSettings
 from tilestream.store import cells_table
 from tilestream.tables import read_tables
 

@@ -14,7 +14,6 @@ import tilestream as ts
 from tilestream.errors import PlanError, UsageError
 from tilestream.factors.observability import observability
 from tilestream.factors.rows import samples_by_tile
-from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.formats.routes import route_of
 from tilestream.marks import Mark
@@ -23,6 +22,7 @@ from tilestream.pipeline.engine.plan import DEFAULT_MEMORY
 from tilestream.pipeline.jobs.along_routes import observe_along, plan_observe
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.observe import Observing
+from tilestream.settings import VirtualSettings
 from tilestream.store import POINTS, Tile
 
 SENSOR = ts.VLP16.model_copy(update={"name": "short", "azimuth_step_deg": 3.0})

@@ -21,7 +21,6 @@ from tilestream.factors.virtual_scan import (
     Beams,
     Scene,
     VirtualScan,
-    VirtualSettings,
     draws,
     first_returns,
     near_share,
@@ -35,6 +34,7 @@ from tilestream.kernels.depth_image import thin
 from tilestream.kernels.surfels import NORMAL_ONE, surfels_of
 from tilestream.kernels.virtual_scan import cast
 from tilestream.marks import Mark
+from tilestream.settings import VirtualSettings
 
 Floats = np.ndarray
 EDGE = 200

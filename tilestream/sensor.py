@@ -1,11 +1,14 @@
 """Sensors as data: the numbers that describe a lidar; users write them down for their own."""
 
 import itertools
+from pathlib import Path
 from typing import Annotated, Self
 
+import yaml
 from pydantic import Field, model_validator
 
-from tilestream.settings import Settings
+from tilestream.config import Settings
+from tilestream.errors import UsageError
 
 
 class Sensor(Settings):
@@ -76,3 +79,22 @@ OS1_128 = Sensor(
 
 SENSORS = {sensor.name: sensor for sensor in (VLP16, HDL64, OS1_128)}
 """The sensors that ship with tilestream, by name."""
+
+
+def sensor_of(name: str) -> Sensor:
+    """A sensor by its name, or from a YAML file with the fields of `Sensor`.
+
+    Raises:
+        UsageError: no such file or sensor, no mapping of fields, a field that cannot be.
+    """
+    if name in SENSORS:
+        return SENSORS[name]
+    if not Path(name).is_file():
+        raise UsageError(f"{name}: no such sensor or file; known are {', '.join(SENSORS)}")
+    try:
+        fields = yaml.safe_load(Path(name).read_text())
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise UsageError(f"{name}: no YAML: {error}") from None
+    if not isinstance(fields, dict):
+        raise UsageError(f"{name}: give the fields of a sensor, e.g. range_max: 100.0")
+    return Sensor(**fields)

@@ -15,7 +15,6 @@ import pandas as pd
 
 from tilestream.errors import PartialError, UsageError
 from tilestream.factors.rows import in_route_order, samples_by_tile
-from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.grid import MM_PER_M, whole_mm
 from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, paths_of
@@ -26,7 +25,7 @@ from tilestream.pipeline.stages.observe import Observing, observe
 from tilestream.records import Route
 from tilestream.report.comparison import CELL_COLUMNS, ROW_COLUMNS, USUAL, Comparison
 from tilestream.sensor import Sensor
-from tilestream.settings import RegistrationSettings
+from tilestream.settings import RegistrationSettings, VirtualSettings
 from tilestream.store import TileStore, cells_table
 from tilestream.tables import read_tables, remove_others
 

@@ -24,7 +24,6 @@ from tilestream.factors.virtual_scan import (
     Beams,
     Scene,
     VirtualScan,
-    VirtualSettings,
     first_returns,
     near_share,
     virtual_scan,
@@ -35,7 +34,7 @@ from tilestream.kernels.cells import cell_of_points, cell_sums
 from tilestream.records import Cells, Column, Float64, Int64
 from tilestream.registration import register
 from tilestream.sensor import VLP16, Sensor
-from tilestream.settings import RegistrationSettings
+from tilestream.settings import RegistrationSettings, VirtualSettings
 from tilestream.store import TileStore
 
 BLOCK = 25.0

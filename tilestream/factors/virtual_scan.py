@@ -3,11 +3,9 @@
 """
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from tilestream.factors.surfels import Surfels
 from tilestream.grid import MM_PER_M
@@ -26,36 +24,10 @@ from tilestream.kernels.virtual_scan import (
 )
 from tilestream.records import Float64, Int64
 from tilestream.sensor import Sensor
-from tilestream.settings import Settings
+from tilestream.settings import VirtualSettings
 
 COLUMN_MM = 10_000
 """Edge of the columns that tell where the map has anything [mm]."""
-
-Share = Annotated[float, Field(ge=0.0, le=1.0)]
-
-
-class VirtualSettings(Settings):
-    """How a vehicle sees with its sensor, and how it is started in the virtual drive."""
-
-    range_max: Annotated[float, Field(gt=0.0)] | None = None
-    """Usable range [m], no more than the sensor's; None: the sensor's."""
-    range_min: Annotated[float, Field(ge=0.0)] = 0.9
-    """Surfels nearer than this are ignored: the vehicle itself is there [m]."""
-    blind_rear_deg: Annotated[float, Field(ge=0.0, lt=360.0)] = 0.0
-    """Sector to the rear that the vehicle hides [deg]."""
-    fading_from: Share = 0.6
-    """Share of the usable range beyond which returns are lost …"""
-    fading: Share = 0.6
-    """… up to this share of them at its end, linearly."""
-    grazing_deg: Annotated[float, Field(gt=0.0, lt=90.0)] = 75.0
-    """Angle of incidence beyond which returns are lost, more as its cosine falls to 0 [deg]."""
-    without_ghosts: bool = True
-    """Whether traffic that the survey recorded is left out of the scan (ghosts); some thin objects
-    such as posts are left out with it."""
-    starts: Annotated[int, Field(ge=8)] | None = 64
-    """Starts of the virtual drive, spread over the disc of starts; None: all of them."""
-    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
-    """Seed of noise and drop-outs; the place is part of it too."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,13 +9,12 @@ import numpy as np
 import yaml
 from pydantic import Field
 
+from tilestream.config import Settings
 from tilestream.errors import SourceNotFoundError, UsageError
-from tilestream.sensor import HDL64, OS1_128, VLP16, Sensor
-from tilestream.settings import Settings
+from tilestream.sensor import SENSORS, Sensor
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Length = Annotated[float, Field(ge=0.0)]
-SENSORS = {sensor.name: sensor for sensor in (VLP16, HDL64, OS1_128)}
 
 
 class CitySettings(Settings):

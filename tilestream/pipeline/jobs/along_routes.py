@@ -9,7 +9,6 @@ import pandas as pd
 from tilestream.errors import PartialError
 from tilestream.factors.catalogue import Which
 from tilestream.factors.rows import Samples, in_route_order, samples_by_tile
-from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.grid import TileKey, whole_mm
 from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, paths_of
@@ -18,7 +17,7 @@ from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.observe import Observing, observe, observe_task
 from tilestream.records import Route
 from tilestream.sensor import VLP16, Sensor
-from tilestream.settings import RegistrationSettings
+from tilestream.settings import RegistrationSettings, VirtualSettings
 from tilestream.store import TileStore
 from tilestream.tables import read_tables, remove_others
 

@@ -38,11 +38,12 @@ from tilestream.pipeline.jobs.ingest import Reading
 from tilestream.pipeline.jobs.run_findings import Done, findings_of
 from tilestream.pipeline.jobs.run_inputs import Inputs, check_model, inputs_of, read_map
 from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
-from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
+from tilestream.pipeline.jobs.run_settings import read_settings
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.samples import DatasetFile
 from tilestream.report import write_report
 from tilestream.report.summary import plain
+from tilestream.settings import RunSettings
 from tilestream.store import TileStore, open_store
 from tilestream.tables import remove_others
 from tilestream.version import VERSION

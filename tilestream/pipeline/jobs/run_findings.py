@@ -16,11 +16,11 @@ from tilestream.model.models import FORESTS
 from tilestream.model.training import MAIN, PREDICTION_COLUMNS
 from tilestream.pipeline.engine.plan import paths_of
 from tilestream.pipeline.engine.stage import Task
-from tilestream.pipeline.jobs.run_settings import ModelSettings
 from tilestream.pipeline.stages.evaluate import by_protocol
 from tilestream.pipeline.stages.samples import places_with_factors
 from tilestream.records import Float64
 from tilestream.report.data import AROUND, Findings
+from tilestream.settings import ModelSettings
 from tilestream.store import TileStore
 from tilestream.tables import read_tables, remove_others
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from tilestream.errors import ModelError, SourceNotFoundError, UsageError
-from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.formats.logs.mcap import ScanSelection
 from tilestream.formats.routes import read_routes
 from tilestream.model.dataset import made_with
@@ -15,13 +14,20 @@ from tilestream.model.model_file import load_model
 from tilestream.model.training import check_making
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.jobs.ingest import Reading, read_sources
-from tilestream.pipeline.jobs.run_settings import DriveSettings, RunSettings, SimulateSettings
 from tilestream.pipeline.jobs.simulate import simulate
 from tilestream.pipeline.stages.drive_scans import Reading as DriveReading
 from tilestream.pipeline.stages.observe import Observing
 from tilestream.pipeline.stages.samples import COLUMNS
 from tilestream.records import Route
-from tilestream.settings import IngestSettings
+from tilestream.settings import (
+    DriveSettings,
+    IngestSettings,
+    LogSettings,
+    MapSettings,
+    RunSettings,
+    SimulateSettings,
+    VirtualSettings,
+)
 from tilestream.simulation.settings import SimulationSettings, load_preset
 from tilestream.store import open_store
 
@@ -154,7 +160,7 @@ def read_map(settings: RunSettings, inputs: Inputs) -> Reading | None:
     return read_sources(
         inputs.sources,
         settings.store_url,
-        ingest_settings(settings),
+        ingest_settings(settings.map),
         settings.memory,
         settings.map.points_topic,
         settings.map.pose_topic,
@@ -162,17 +168,25 @@ def read_map(settings: RunSettings, inputs: Inputs) -> Reading | None:
     )
 
 
-def ingest_settings(settings: RunSettings) -> IngestSettings:
-    """How the map is cut into tiles."""
-    names = set(IngestSettings.model_fields)
-    return IngestSettings(**settings.map.model_dump(include=names))
+def ingest_settings(settings: MapSettings) -> IngestSettings:
+    """How a map is cut into tiles."""
+    return IngestSettings(**settings.model_dump(include=set(IngestSettings.model_fields)))
 
 
 def map_scans(settings: RunSettings, inputs: Inputs) -> ScanSelection | None:
     """Which scans of logs become the map; None: there are no logs among the sources."""
     if any(source.lower().endswith(".mcap") for source in inputs.sources):
-        return ScanSelection(every=settings.map.every, offset=settings.map.offset)
+        return scans_of(settings.map)
     return None
+
+
+def scans_of(log: LogSettings) -> ScanSelection:
+    """Which scans of a log are used.
+
+    Raises:
+        UsageError: an offset that is not below `every`.
+    """
+    return ScanSelection(every=log.every, offset=log.offset, from_s=log.from_s, until_s=log.until_s)
 
 
 def is_simulated(settings: RunSettings) -> bool:
@@ -239,7 +253,7 @@ def reading_of(drive: DriveSettings) -> DriveReading:
         SourceNotFoundError: there is no such log.
     """
     if not Path(drive.log).is_file():
-        raise SourceNotFoundError(f"{drive.log}: no such log; see drives in the config")
+        raise SourceNotFoundError(f"{drive.log}: no such log")
     return DriveReading(
         drive.log,
         drive.points_topic,

@@ -6,7 +6,6 @@ from typing import Any
 from tilestream.factors import catalogue
 from tilestream.factors.rows import samples_by_tile
 from tilestream.factors.virtual_drive import NEIGHBOURS
-from tilestream.formats.logs.mcap import ScanSelection
 from tilestream.grid import MM_PER_M, TileGrid, TileKey
 from tilestream.model.dataset import TARGETS, features_of
 from tilestream.model.evaluation import factor_sets
@@ -18,8 +17,13 @@ from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.engine.stage import Readable, Task
 from tilestream.pipeline.jobs.along_routes import plan_factors, plan_observe
 from tilestream.pipeline.jobs.localize import plan_localize
-from tilestream.pipeline.jobs.run_inputs import Inputs, making_of, observing_of, reading_of
-from tilestream.pipeline.jobs.run_settings import RunSettings
+from tilestream.pipeline.jobs.run_inputs import (
+    Inputs,
+    making_of,
+    observing_of,
+    reading_of,
+    scans_of,
+)
 from tilestream.pipeline.stages.evaluate import evaluate
 from tilestream.pipeline.stages.factors import Looking
 from tilestream.pipeline.stages.importance import importance
@@ -27,6 +31,7 @@ from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.predict import predict
 from tilestream.pipeline.stages.samples import COLUMNS, DatasetFile, samples
 from tilestream.pipeline.stages.train import ModelFile, ModelInUse, train
+from tilestream.settings import RunSettings
 
 OPPONENT = "training median"
 """Whom a part of the error is judged against: the others know no more of unseen paths."""
@@ -50,26 +55,23 @@ def plan_measure(settings: RunSettings, inputs: Inputs, map_plan: MapPlan) -> Pl
     if settings.observe is not None:
         observing = observing_of(settings, settings.observe)
         plans.append(plan_observe(map_plan, places, tables, observing, memory))
-    for drive in inputs.drives:
-        scans = ScanSelection(
-            every=drive.every, offset=drive.offset, from_s=drive.from_s, until_s=drive.until_s
+    plans += [
+        plan_localize(
+            map_plan,
+            reading_of(drive),
+            tables,
+            cell_size=settings.cell_size,
+            spacing=settings.spacing,
+            registration=settings.label.registration,
+            starts=settings.label.starts,
+            true_pose=settings.label.true_pose,
+            scans=scans_of(drive),
+            starts_per_task=None,
+            memory=memory,
+            group=drive.group,
         )
-        plans.append(
-            plan_localize(
-                map_plan,
-                reading_of(drive),
-                tables,
-                cell_size=settings.cell_size,
-                spacing=settings.spacing,
-                registration=settings.label.registration,
-                starts=settings.label.starts,
-                true_pose=settings.label.true_pose,
-                scans=scans,
-                starts_per_task=None,
-                memory=memory,
-                group=drive.group,
-            )
-        )
+        for drive in inputs.drives
+    ]
     return Plan.of((task for plan in plans for task in plan.tasks), memory)
 
 

@@ -6,7 +6,6 @@ import pandas as pd
 
 from tilestream.factors.observability import COLUMNS, MARGIN, observability
 from tilestream.factors.rows import PLACE_COLUMNS, STATUS_COLUMNS, Samples, sample_rows
-from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.grid import Box, TileKey, whole_mm
 from tilestream.marks import canonical
 from tilestream.pipeline.engine.outputs import Made, Parquet
@@ -14,7 +13,7 @@ from tilestream.pipeline.engine.stage import Task, stage
 from tilestream.pipeline.stages.map_part import MapPart
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.sensor import Sensor
-from tilestream.settings import RegistrationSettings
+from tilestream.settings import RegistrationSettings, VirtualSettings
 
 FIXED_BYTES = 600_000_000
 """Memory of the task besides what it reads: a scene, the registrations, and the terms that factors
