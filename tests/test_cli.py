@@ -536,6 +536,7 @@ def test_localize_prints_the_errors(log: Path, store: str, tmp_path: Path, capsy
     assert run(["localize", store, str(log), *few, "--until-s", "5"]) == 0
     shown = capsys.readouterr().out
     assert re.search(r" 5 +sample points", shown)
+    assert re.search(r" autoware +the matcher", shown)
     assert re.search(r" \d+\.\d cm +mean error", shown)
     assert shown.count("of the worst places") == 3
     assert "mean_m" not in shown
@@ -549,6 +550,7 @@ def test_localize_prints_the_errors(log: Path, store: str, tmp_path: Path, capsy
         ts.open_store(store), log, tmp_path / "again", starts=ts.StartSettings(radius=0.4)
     )
     assert (facts["sample_points"], facts["failed"]) == (6, 1)
+    assert facts["matcher"] == "autoware"
     assert facts["mean_m"] == pytest.approx(labels["error_mean"].mean())
     assert facts["max_m"] == labels["error_mean"].max()
     assert facts["share_over_0.10_m"] == (labels["error_mean"].dropna() > 0.1).mean()

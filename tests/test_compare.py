@@ -302,10 +302,12 @@ def test_the_command_compares_and_explains_itself(
         "short-8m-cell2m",
         "short-12m-cell2m",
     ]
+    assert told["facts"]["matcher"] == "autoware"
     assert (tmp_path / "out" / "compare.html").is_file()
     assert run([*line, "--spacing", "16"]) == 0
     shown = capsys.readouterr().out
     assert "short-12m-cell2m" in shown
+    assert "matcher autoware" in shown
     assert "compare.html" in shown
     for wrong, why in (
         (["--cell-size", "2.0,3.0"], "sizes that fit are .* 1, .* 2, .* fit tiles of 18 m"),

@@ -35,8 +35,6 @@ GROUPS: tuple[type[Settings], ...] = (
     SimulationSettings,
 )
 OWN = {
-    ("localize", "matcher"): "as it was",
-    ("compare", "matcher"): "as it was",
     ("compare", "spacing"): "a comparison needs fewer places than an estimate",
     ("compare", "sensor"): "several",
     ("compare", "cell_size"): "several",

@@ -25,7 +25,7 @@ from tilestream.pipeline.stages.observe import Observing, observe
 from tilestream.records import Route
 from tilestream.report.comparison import CELL_COLUMNS, ROW_COLUMNS, USUAL, Comparison
 from tilestream.sensor import Sensor
-from tilestream.settings import RegistrationSettings, VirtualSettings
+from tilestream.settings import LabelSettings, RegistrationSettings, VirtualSettings
 from tilestream.store import TileStore, cells_table
 from tilestream.tables import read_tables, remove_others
 
@@ -124,7 +124,7 @@ def compare(
             fsspec URL; other tables of these choices there are removed.
         choices: what is compared, at least one, no two of one name.
         spacing: distance between sample points [m].
-        registration: the matcher of the vehicle; default `RegistrationSettings()`.
+        registration: the matcher of the vehicle; default `autoware`, as of all jobs.
         sensor_height: height of the lidar above the route or the ground [m].
         seeing: drop-outs, starts, seed; its range and blind sector give way to each choice's.
         client: a Dask client to run on; None: this process.
@@ -141,7 +141,7 @@ def compare(
         PlanError: a task does not fit `memory`.
         PartialError: some tasks failed; the message lists them, the rest is done.
     """
-    routes, registration = list(routes), registration or RegistrationSettings()
+    routes, registration = list(routes), registration or LabelSettings().registration
     seeing = seeing or VirtualSettings()
     plan = plan_compare(
         store, routes, out, choices, spacing, registration, sensor_height, seeing, memory
@@ -166,6 +166,7 @@ def compare(
         "tile_size": store.settings.tile_size,
         "spacing": spacing,
         "sensor_height": sensor_height,
+        "matcher": registration.told,
         **{f"registration.{name}": value for name, value in registration.model_dump().items()},
         **{f"seeing.{name}": value for name, value in seeing.model_dump(exclude=own).items()},
     }

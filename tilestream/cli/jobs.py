@@ -80,6 +80,7 @@ def show_report(folder: Path) -> None:
     """Print the headline of a report and where it is."""
     report = report_of(folder)
     out.print(report_table(report, cards(report)))
+    say(f"The matcher is {report['facts']['matcher']['name']}")
     for line in lost_labels(folder):
         say(line)
     say(f"The report is at {(folder / 'report' / 'index.html').absolute()}")

@@ -48,7 +48,7 @@ def localize(
     store: StoreUrl,
     folder: Annotated[str, typer.Option("--out", help="Folder of the tables.")],
     places: Annotated[PlaceSettings, fields("cell_size", "spacing", "memory")],
-    labels: Annotated[LabelSettings, fields("matcher", "true_pose", matcher="default")],
+    labels: Annotated[LabelSettings, fields("matcher", "true_pose")],
     leaf: Annotated[RegistrationSettings, fields("scan_leaf")],
     starts: Annotated[StartSettings, fields("radius", "step")],
     drive: Annotated[
@@ -87,9 +87,9 @@ def localize(
             opened, drive.log, folder, **how, reading=reading, client=client, watch=watch
         )
     if as_json:
-        print_json(error_facts(found))
+        print_json({"matcher": registration.told, **error_facts(found)})
     else:
-        out.print(error_table(found))
+        out.print(error_table(found, registration.told))
         say(f"The tables are in {folder}/errors and {folder}/starts")
     failed = found[found["status"] != "done"]
     if len(failed):
@@ -159,7 +159,7 @@ def compare(
         PlaceSettings,
         fields("spacing", "sensor_height", "project_to", "memory", spacing=comparing.SPACING),
     ],
-    labels: Annotated[LabelSettings, fields("matcher", matcher="default")],
+    labels: Annotated[LabelSettings, fields("matcher")],
     report: Annotated[ReportSettings, fields("threshold")],
     sensor: Annotated[
         list[str], typer.Option(help=f"{', '.join(SENSORS)}, or a YAML file; several times.")

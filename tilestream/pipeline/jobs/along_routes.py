@@ -17,7 +17,7 @@ from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.observe import Observing, observe, observe_task
 from tilestream.records import Route
 from tilestream.sensor import VLP16, Sensor
-from tilestream.settings import RegistrationSettings, VirtualSettings
+from tilestream.settings import LabelSettings, RegistrationSettings, VirtualSettings
 from tilestream.store import TileStore
 from tilestream.tables import read_tables, remove_others
 
@@ -119,7 +119,7 @@ def observe_along(
         spacing: distance between sample points [m].
         sensor: what looks.
         seeing: usable range, blind sector, drop-outs, starts; default `VirtualSettings()`.
-        registration: the matcher of the vehicle; default `RegistrationSettings()`.
+        registration: the matcher of the vehicle; default `autoware`, as of all jobs.
         sensor_height: height of the lidar above the route, or above the ground where the route
             has no z [m].
         cell_size: edge of an NDT cell [m].
@@ -140,7 +140,7 @@ def observe_along(
     observing = Observing(
         sensor,
         seeing or VirtualSettings(),
-        registration or RegistrationSettings(),
+        registration or LabelSettings().registration,
         cell_size,
         sensor_height,
     )

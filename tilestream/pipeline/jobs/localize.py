@@ -23,7 +23,7 @@ from tilestream.pipeline.stages.label import label
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.register import MARGIN, Measuring, register
 from tilestream.records import Float64, TruePose
-from tilestream.settings import RegistrationSettings, StartSettings
+from tilestream.settings import LabelSettings, RegistrationSettings, StartSettings
 from tilestream.store import TileStore
 from tilestream.tables import read_tables, remove_others
 
@@ -63,7 +63,7 @@ def localize(
             a local path or any fsspec URL.
         cell_size: edge of an NDT cell [m].
         spacing: distance between sample points along the drive [m].
-        registration: the matcher; default `RegistrationSettings()`.
+        registration: the matcher; default `autoware`, as of all jobs.
         starts: the starts; default the paper's 317.
         true_pose: `log`, or `refined` as the paper does.
         scans: which scans to use; default all.
@@ -90,7 +90,7 @@ def localize(
         out,
         cell_size=cell_size,
         spacing=spacing,
-        registration=registration or RegistrationSettings(),
+        registration=registration or LabelSettings().registration,
         starts=starts or StartSettings(),
         true_pose=true_pose,
         scans=scans or ScanSelection(),

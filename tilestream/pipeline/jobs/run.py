@@ -380,7 +380,10 @@ def _facts(
         "labelled places": 0 if known is None else len(known),
         "lost labels": {} if known is None else known.losses,
         "model": _model_facts(settings, book),
-        "matcher": settings.label.registration.model_dump(),
+        "matcher": {
+            "name": settings.label.registration.told,
+            **settings.label.registration.model_dump(),
+        },
         "settings": effective,
         "drives": {d.group: d.model_dump(exclude_defaults=True) for d in inputs.drives},
         "core-seconds by stage, all calls": stages,
