@@ -4,7 +4,9 @@ import itertools
 from pathlib import Path
 from typing import Annotated, Self
 
+import numpy as np
 import yaml
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from tilestream.config import Settings
@@ -28,6 +30,14 @@ class Sensor(Settings):
     """Turns per second [1/s]."""
     range_noise: Annotated[float, Field(ge=0.0)] = 0.02
     """Standard deviation of a range [m]."""
+
+    def with_beams(self, beams: int) -> Self:
+        """The sensor with so many of its beams, evenly spread; with all where it has no more."""
+        recorded = len(self.elevations_deg)
+        if beams >= recorded:
+            return self
+        kept = tuple(self.elevations_deg[row] for row in kept_beams(recorded, beams))
+        return self.model_copy(update={"elevations_deg": kept})
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -79,6 +89,13 @@ OS1_128 = Sensor(
 
 SENSORS = {sensor.name: sensor for sensor in (VLP16, HDL64, OS1_128)}
 """The sensors that ship with tilestream, by name."""
+
+
+def kept_beams(recorded: int, beams: int) -> NDArray[np.int64]:
+    """(beams,) which of the recorded beams, from the lowest up, a lidar of fewer beams has: evenly
+    spread over them.
+    """
+    return ((np.arange(beams) + 0.5) * recorded / beams).astype(np.int64)
 
 
 def sensor_of(name: str) -> Sensor:

@@ -111,6 +111,16 @@ class DriveSettings(LogSettings):
         """The name of its labels."""
         return self.name or Path(self.log).stem
 
+    @property
+    def degraded(self) -> str:
+        """As if by which lidar it is read, e.g. `16beams-30m-rear120`; empty: as recorded."""
+        parts = (
+            f"{self.beams}beams" if self.beams else "",
+            f"{self.range_max:.10g}m" if self.range_max else "",
+            f"rear{self.blind_rear_deg:.10g}" if self.blind_rear_deg else "",
+        )
+        return "-".join(part for part in parts if part)
+
 
 class RegistrationSettings(Settings):
     """The matcher: 3D-NDT as definitions, section 5.1, fixes it. It decides the label."""

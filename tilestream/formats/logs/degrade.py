@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from tilestream.errors import UsageError
 from tilestream.records import Float64, Scan
+from tilestream.sensor import kept_beams
 
 COLUMN_DEG = 0.25
 """Width of the azimuth columns in which gaps between beams are measured: about a firing [deg]."""
@@ -75,8 +76,7 @@ def _on_beams(scan: Scan, beams: int, recorded: int | None) -> NDArray[np.bool_]
         recorded = recorded or int(scan.ring.max()) + 1
         _check_enough(beams, recorded)
         order = _rings_by_elevation(scan.points, scan.ring, recorded)
-        chosen = order[((np.arange(beams) + 0.5) * recorded / beams).astype(np.int64)]
-        return np.isin(scan.ring, chosen)
+        return np.isin(scan.ring, order[kept_beams(recorded, beams)])
     elevation = _elevation_deg(scan.points)
     low, high = np.percentile(elevation, [0.5, 99.5])
     if recorded:

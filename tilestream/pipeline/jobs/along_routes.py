@@ -12,6 +12,7 @@ from tilestream.factors.rows import Samples, in_route_order, samples_by_tile
 from tilestream.grid import TileKey, whole_mm
 from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, paths_of
+from tilestream.pipeline.engine.stage import Stage
 from tilestream.pipeline.stages.factors import Looking, factors, factors_task
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.observe import Observing, observe, observe_task
@@ -156,6 +157,7 @@ def plan_observe(
     observing: Observing,
     memory: int,
     group: str = "",
+    applies: Stage = observe,
 ) -> Plan:
     """What `observe_along` will run; other arguments and errors as there.
 
@@ -166,11 +168,13 @@ def plan_observe(
         observing: what is observed with.
         memory: what a task may use [bytes].
         group: as whose sensor, where one plan observes with several.
+        applies: `observe`, or `observe_drive`.
     """
     map_plan.store.grid.require_cell_size(whole_mm(observing.cell_size, "cell_size"))
     folder = os.fspath(out)
     tasks = [
-        observe_task(map_plan, key, some, observing, folder, group) for key, some in samples.items()
+        observe_task(map_plan, key, some, observing, folder, group, applies)
+        for key, some in samples.items()
     ]
     return Plan.of((*map_plan.tasks.values(), *tasks), memory)
 

@@ -1,7 +1,7 @@
 """What the main job works on: its settings and files."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from glob import glob
 from pathlib import Path
 from typing import Any
@@ -206,6 +206,33 @@ def observing_of(settings: RunSettings, seeing: VirtualSettings) -> Observing:
         settings.cell_size,
         settings.sensor_height,
     )
+
+
+def observing_drive(
+    settings: RunSettings, seeing: VirtualSettings, drive: DriveSettings
+) -> Observing:
+    """What a drive is observed with: the vehicle's lidar, as far as the drive is read as a lesser
+    one; that of the vehicle itself where it is not.
+    """
+    vehicle = observing_of(settings, seeing)
+    changes: dict[str, float] = {}
+    if drive.range_max is not None and drive.range_max < vehicle.range_max:
+        changes["range_max"] = drive.range_max
+    if drive.blind_rear_deg is not None and drive.blind_rear_deg > seeing.blind_rear_deg:
+        changes["blind_rear_deg"] = drive.blind_rear_deg
+    sensor = vehicle.sensor if drive.beams is None else vehicle.sensor.with_beams(drive.beams)
+    return replace(vehicle, sensor=sensor, seeing=seeing.model_copy(update=changes))
+
+
+def degraded_drives(settings: RunSettings, drives: Sequence[DriveSettings]) -> dict[str, Observing]:
+    """What the drives are observed with that are read as another lidar than the vehicle's, by
+    `DriveSettings.degraded`.
+    """
+    if settings.observe is None:
+        return {}
+    vehicle = observing_of(settings, settings.observe)
+    found = {d.degraded: observing_drive(settings, settings.observe, d) for d in drives}
+    return {name: observing for name, observing in found.items() if observing != vehicle}
 
 
 def making_of(settings: RunSettings) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from tilestream.factors.rows import PLACE_COLUMNS, STATUS_COLUMNS, Samples, samp
 from tilestream.grid import Box, TileKey, whole_mm
 from tilestream.marks import canonical
 from tilestream.pipeline.engine.outputs import Made, Parquet
-from tilestream.pipeline.engine.stage import Task, stage
+from tilestream.pipeline.engine.stage import Stage, Task, stage
 from tilestream.pipeline.stages.map_part import MapPart
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.sensor import Sensor
@@ -67,6 +67,19 @@ def observe(map_part: MapPart, samples: Samples, observing: Observing) -> Made:
     return Made(pd.concat([frame, found], axis=1), {"data_set": canonical(observing)})
 
 
+@stage(
+    "observe_drive",
+    version=observe.version,
+    memory=observe.memory,
+    seconds=observe.seconds,
+    columns=observe.columns,
+)
+def observe_drive(map_part: MapPart, samples: Samples, observing: Observing) -> Made:
+    """The same as the lidar sees that a drive is read as: what its labels are joined with."""
+    made: Made = observe.function(map_part, samples, observing)
+    return made
+
+
 def observe_task(
     plan: MapPlan,
     tile: TileKey,
@@ -74,6 +87,7 @@ def observe_task(
     observing: Observing,
     folder: str,
     group: str = "",
+    applies: Stage = observe,
 ) -> Task:
     """The observability of the sample points of a tile, from surfels and cells of those in sight.
 
@@ -84,12 +98,13 @@ def observe_task(
         observing: what is observed with.
         folder: of the tables.
         group: as whose sensor, where one plan observes with several.
+        applies: `observe`, or `observe_drive`.
     """
     cell_mm = whole_mm(observing.cell_size, "cell_size")
     seen = plan.over(Box.around(samples.places, observing.range_max + MARGIN))
     made = [task for k in seen for task in (plan.cells(k, cell_mm), plan.surfels(k))]
     return Task(
-        observe,
+        applies,
         "-".join(part for part in (group, str(tile)) if part),
         Parquet(f"{folder}/observability/{tile}.parquet"),
         takes={"samples": samples, "observing": observing},
