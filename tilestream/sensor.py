@@ -12,6 +12,9 @@ from pydantic import Field, model_validator
 from tilestream.config import Settings
 from tilestream.errors import UsageError
 
+EDGE = 1e-9
+"""Slack of angles, so that rounding decides nothing [rad]."""
+
 
 class Sensor(Settings):
     """A spinning lidar."""
@@ -30,6 +33,25 @@ class Sensor(Settings):
     """Turns per second [1/s]."""
     range_noise: Annotated[float, Field(ge=0.0)] = 0.02
     """Standard deviation of a range [m]."""
+
+    def rays(self, first_azimuth: float = 0.0, clockwise: bool = False) -> NDArray[np.float64]:
+        """(firings, beams, 3) unit vectors of one turn in the lidar frame: x ahead, y left, z up;
+        firing by firing, each from the lowest beam to the highest.
+
+        Args:
+            first_azimuth: where the turn begins [rad, from x to y].
+            clockwise: its sense, seen from above.
+        """
+        firings = round(360.0 / self.azimuth_step_deg)
+        turn = np.arange(firings) * (2.0 * np.pi / firings)
+        azimuth = first_azimuth - turn if clockwise else first_azimuth + turn
+        elevation = np.deg2rad(self.elevations_deg)
+        across, up = np.cos(elevation), np.sin(elevation)
+        direction = np.empty((firings, len(elevation), 3))
+        direction[..., 0] = np.cos(azimuth)[:, None] * across
+        direction[..., 1] = np.sin(azimuth)[:, None] * across
+        direction[..., 2] = up
+        return direction
 
     def with_beams(self, beams: int) -> Self:
         """The sensor with so many of its beams, evenly spread; with all where it has no more."""
@@ -89,6 +111,21 @@ OS1_128 = Sensor(
 
 SENSORS = {sensor.name: sensor for sensor in (VLP16, HDL64, OS1_128)}
 """The sensors that ship with tilestream, by name."""
+
+
+def in_blind_sector(
+    points: NDArray[np.float64], blind_deg: float, slack: float = EDGE
+) -> NDArray[np.bool_]:
+    """(…,) whether points or directions lie in the sector that the vehicle hides to its rear.
+
+    Args:
+        points: (…, 3) in a frame with x ahead and y left.
+        blind_deg: width of the sector, centred on -x [deg].
+        slack: beams this near to its edge are outside [rad]; 0: what lies at the edge is inside.
+    """
+    from_rear = np.abs(np.arctan2(points[..., 1], -points[..., 0]))
+    hidden: NDArray[np.bool_] = from_rear <= np.deg2rad(blind_deg) / 2.0 - slack
+    return hidden
 
 
 def kept_beams(recorded: int, beams: int) -> NDArray[np.int64]:

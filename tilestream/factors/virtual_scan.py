@@ -23,7 +23,7 @@ from tilestream.kernels.virtual_scan import (
     mark_bricks,
 )
 from tilestream.records import Float64, Int64
-from tilestream.sensor import Sensor
+from tilestream.sensor import Sensor, in_blind_sector
 from tilestream.settings import VirtualSettings
 
 COLUMN_MM = 10_000
@@ -84,19 +84,10 @@ class Beams:
     @classmethod
     def of(cls, sensor: Sensor, seeing: VirtualSettings) -> "Beams":
         """The beams of a sensor, without its blind sector."""
-        firings = round(360.0 / sensor.azimuth_step_deg)
-        azimuth = np.arange(firings) * (2.0 * np.pi / firings)
-        if seeing.blind_rear_deg > 0.0:
-            blind = np.deg2rad(seeing.blind_rear_deg) / 2.0
-            azimuth = azimuth[np.abs(azimuth - np.pi) > blind - 1e-9]
-        elevation = np.deg2rad(np.array(sensor.elevations_deg))
-        across, up = np.cos(elevation), np.sin(elevation)
-        direction = np.empty((len(azimuth), len(elevation), 3))
-        direction[..., 0] = np.cos(azimuth)[:, None] * across
-        direction[..., 1] = np.sin(azimuth)[:, None] * across
-        direction[..., 2] = up
+        direction = sensor.rays().reshape(-1, 3)
+        direction = direction[~in_blind_sector(direction, seeing.blind_rear_deg)]
         reach = sensor.range_max if seeing.range_max is None else seeing.range_max
-        return cls(direction.reshape(-1, 3), min(reach, sensor.range_max))
+        return cls(direction, min(reach, sensor.range_max))
 
 
 def near_share(scene: Scene, place_mm: Int64, beams: Beams, within: float) -> float:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tilestream.records import Float64, Int64, Scan
-from tilestream.sensor import Sensor
+from tilestream.sensor import Sensor, in_blind_sector
 from tilestream.simulation.mesh import REFLECTIVITY, Material
 from tilestream.simulation.settings import LidarSettings, stream
 
@@ -52,24 +52,16 @@ def turn_of(sensor: Sensor, first_azimuth: float = np.pi, blind_deg: float = 0.0
         first_azimuth: where the turn begins [rad, from x to y]; the cut is at the rear by default.
         blind_deg: sector around the rear that gives nothing [deg].
     """
-    firings = round(360.0 / sensor.azimuth_step_deg)
-    azimuth = first_azimuth - np.arange(firings) * (2 * np.pi / firings)
-    elevation = np.deg2rad(sensor.elevations_deg)
-    beams = len(elevation)
-    across, up = np.cos(elevation), np.sin(elevation)
-    direction = np.empty((firings, beams, 3))
-    direction[..., 0] = np.cos(azimuth)[:, None] * across
-    direction[..., 1] = np.sin(azimuth)[:, None] * across
-    direction[..., 2] = up
+    direction = sensor.rays(first_azimuth, clockwise=True)
+    firings, beams, _ = direction.shape
     time = ((np.arange(firings) + 0.5) / firings - 0.5) / sensor.rate_hz
-    behind = np.abs(np.mod(azimuth, 2 * np.pi) - np.pi)
-    seen = behind >= np.deg2rad(blind_deg) / 2 if blind_deg > 0 else np.ones(firings, bool)
-    number = np.arange(firings * beams).reshape(firings, beams)
+    seen = ~in_blind_sector(direction, blind_deg)
+    firing, ring = np.nonzero(seen)
     return Turn(
-        direction[seen].reshape(-1, 3),
-        np.tile(np.arange(beams, dtype=np.int32), int(seen.sum())),
-        np.repeat(time[seen], beams),
-        number[seen].ravel(),
+        direction[seen],
+        ring.astype(np.int32),
+        time[firing],
+        np.flatnonzero(seen),
         firings * beams,
     )
 

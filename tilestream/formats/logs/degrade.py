@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from tilestream.errors import UsageError
 from tilestream.records import Float64, Scan
-from tilestream.sensor import kept_beams
+from tilestream.sensor import in_blind_sector, kept_beams
 
 COLUMN_DEG = 0.25
 """Width of the azimuth columns in which gaps between beams are measured: about a firing [deg]."""
@@ -51,8 +51,7 @@ def as_lesser(
     if range_max is not None:
         keep &= (scan.points**2).sum(axis=1) <= range_max**2
     if blind_rear_deg:
-        from_rear = np.arctan2(scan.points[:, 1], -scan.points[:, 0])
-        keep &= np.abs(from_rear) > np.radians(blind_rear_deg) / 2
+        keep &= ~in_blind_sector(scan.points, blind_rear_deg, slack=0.0)
     return select(scan, keep)
 
 
