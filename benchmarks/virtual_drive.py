@@ -128,7 +128,7 @@ def cost(folder: Path, spacing: float) -> pd.DataFrame:
         return Scene.of(near, whole_places(places), edge_mm)
 
     made = scene()
-    scan = virtual_scan(made, place_mm, heading, ts.VLP16, seeing, beams)
+    scan = virtual_scan(made, place_mm, heading, seeing, beams)
     T_map_lidar = upright(place_mm, heading)
     points = len(store.tile(key).points())
     rows = [
@@ -142,7 +142,7 @@ def cost(folder: Path, spacing: float) -> pd.DataFrame:
         (
             "scan",
             f"{len(beams.direction)} beams, {len(scan.points)} returns",
-            cpu_ms(lambda: virtual_scan(made, place_mm, heading, ts.VLP16, seeing, beams)),
+            cpu_ms(lambda: virtual_scan(made, place_mm, heading, seeing, beams)),
         ),
     ]
     for name, settings in MATCHERS.items():

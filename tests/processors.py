@@ -32,7 +32,7 @@ def figures(folder: Path) -> dict[str, NDArray[np.float64]]:
         place_mm = np.rint(place * 1000.0).astype(np.int64)
         scene = Scene.of(surfels, place_mm[None], surfel_mm(store))
         beams = Beams.of(ts.VLP16, seeing)
-        scan = virtual_scan(scene, place_mm, 0.0, ts.VLP16, seeing, beams).points
+        scan = virtual_scan(scene, place_mm, 0.0, seeing, beams).points
         still = ts.RegistrationSettings(iterations_max=0)
         hessian.append(ts.register(cells, scan, T_map_lidar, still).hessian[0])
         error.append(ts.localization_error(cells, scan, T_map_lidar).error)

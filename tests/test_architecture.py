@@ -12,7 +12,8 @@ ROOT = Path(tilestream.__file__).parent
 FLOORS = (
     ("errors", "version"),
     ("config", "grid", "marks"),
-    ("kernels", "sensor"),
+    ("kernels",),
+    ("sensor",),
     ("records",),
     ("settings",),
     ("ndt",),

@@ -13,7 +13,7 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 from tilestream.config import Settings
 from tilestream.errors import UsageError
 from tilestream.records import TruePose
-from tilestream.sensor import SENSORS, Sensor, sensor_of
+from tilestream.sensor import SENSORS, Carrier, Sensor, Vehicle, sensor_of
 
 Positive = Annotated[float, Field(gt=0.0)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -289,10 +289,11 @@ class PlaceSettings(Settings):
     """CRS for routes in degrees."""
     spacing: Positive = 1.0
     """Distance between sample points [m]."""
-    sensor: str | Sensor = "VLP16"
-    """The vehicle's lidar: a name (VLP16, HDL64, OS1_128), a YAML file of its fields, or these."""
+    sensor: str | Sensor | Vehicle = "VLP16"
+    """The vehicle's lidar: a name (VLP16, HDL64, OS1_128), a YAML file, its fields, or a list of
+    such, each with its mount."""
     sensor_height: Annotated[float, Field(ge=0.0, le=10.0)] = 2.0
-    """Height of the lidar above the road [m]."""
+    """Height of the lidar above the road [m]; with a mount, of the vehicle's origin."""
     cell_size: Positive = 2.0
     """Edge of an NDT cell [m]."""
     memory: Bytes = Field(default="1.5GB", validate_default=True)
@@ -301,13 +302,18 @@ class PlaceSettings(Settings):
     @field_validator("sensor", mode="before")
     @classmethod
     def _read(cls, sensor: Any) -> Any:
-        known = not isinstance(sensor, str) or sensor in SENSORS
+        known = isinstance(sensor, str) and sensor in SENSORS
         return sensor if known else sensor_of(sensor)
 
     @property
-    def looking_sensor(self) -> Sensor:
-        """The sensor's data."""
+    def vehicle(self) -> Carrier:
+        """The data of its sensor, or sensors."""
         return SENSORS[self.sensor] if isinstance(self.sensor, str) else self.sensor
+
+    @property
+    def looking_sensor(self) -> Sensor:
+        """The sensor as which the paper's factors look: the first."""
+        return self.vehicle.sensors[0]
 
 
 class RunSettings(PlaceSettings):

@@ -24,7 +24,7 @@ from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.observe import Observing, observe
 from tilestream.records import Route
 from tilestream.report.comparison import CELL_COLUMNS, ROW_COLUMNS, USUAL, Comparison
-from tilestream.sensor import Sensor
+from tilestream.sensor import Carrier
 from tilestream.settings import LabelSettings, RegistrationSettings, VirtualSettings
 from tilestream.store import TileStore, cells_table
 from tilestream.tables import read_tables, remove_others
@@ -45,7 +45,7 @@ class Choice:
         UsageError: a range beyond the sensor's, a blind sector or cell size that cannot be.
     """
 
-    sensor: Sensor
+    sensor: Carrier
     """What looks."""
     range_max: float | None = None
     """Usable range [m]; None: the sensor's."""
@@ -87,7 +87,7 @@ class Choice:
 
 
 def choices_of(
-    sensors: Sequence[Sensor],
+    sensors: Sequence[Carrier],
     ranges: Sequence[float | None],
     blind_rears_deg: Sequence[float],
     cell_sizes: Sequence[float],

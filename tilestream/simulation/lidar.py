@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tilestream.records import Float64, Int64, Scan
-from tilestream.sensor import Sensor, in_blind_sector
+from tilestream.sensor import Sensor
 from tilestream.simulation.mesh import REFLECTIVITY, Material
 from tilestream.simulation.settings import LidarSettings, stream
 
@@ -30,10 +30,10 @@ class Target(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Turn:
-    """The rays of one turn of a sensor, in its own frame, in order of their firing."""
+    """The rays of one turn of a sensor, in the order of their firing."""
 
     direction: Float64
-    """(n, 3) unit vectors in the lidar frame: x ahead, y left, z up."""
+    """(n, 3) unit vectors in the frame of the vehicle: x ahead, y left, z up."""
     ring: NDArray[np.int32]
     """(n,) beam, 0 the lowest."""
     time: Float64
@@ -55,10 +55,10 @@ def turn_of(sensor: Sensor, first_azimuth: float = np.pi, blind_deg: float = 0.0
     direction = sensor.rays(first_azimuth, clockwise=True)
     firings, beams, _ = direction.shape
     time = ((np.arange(firings) + 0.5) / firings - 0.5) / sensor.rate_hz
-    seen = ~in_blind_sector(direction, blind_deg)
+    seen = sensor.fires(direction, blind_deg)
     firing, ring = np.nonzero(seen)
     return Turn(
-        direction[seen],
+        sensor.in_base(direction[seen]),
         ring.astype(np.int32),
         time[firing],
         np.flatnonzero(seen),
@@ -82,7 +82,8 @@ def measure(
 
     Args:
         targets: scenes of what stands and what moves; the nearest hit counts.
-        T_map_lidar: (4, 4) pose in the middle of the turn.
+        T_map_lidar: (4, 4) pose of the vehicle's frame in the middle of the turn; without a mount
+            it is that of the lidar.
         velocity: (3,) of the lidar in the map [m/s].
         yaw_rate: turning of the vehicle [rad/s].
         settings: of the lidar.
@@ -93,7 +94,8 @@ def measure(
     rng = stream(seed[0], "scan noise", *seed[1:])
     turn = turn_of(sensor, rng.uniform(-np.pi, np.pi), settings.blind_deg)
     time = turn.time if settings.distortion else np.zeros(len(turn.time))
-    start = T_map_lidar[:3, 3] + time[:, None] * velocity
+    origin = sensor.mount.T_base_lidar[:3, 3]
+    start = T_map_lidar[:3, :3] @ origin + T_map_lidar[:3, 3] + time[:, None] * velocity
     angle = time * yaw_rate
     local = turn.direction
     turned = np.column_stack(
@@ -117,7 +119,7 @@ def measure(
     light = REFLECTIVITY[material[came]] * (0.3 + 0.7 * cosine[came])
     return Scan(
         stamp_ns,
-        local[came] * measured[:, None],
+        local[came] * measured[:, None] + origin,
         T_map_lidar,
         light.astype(np.float32),
         turn.ring[came],

@@ -17,7 +17,7 @@ from tilestream.pipeline.stages.factors import Looking, factors, factors_task
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.observe import Observing, observe, observe_task
 from tilestream.records import Route
-from tilestream.sensor import VLP16, Sensor
+from tilestream.sensor import VLP16, Carrier, Sensor
 from tilestream.settings import LabelSettings, RegistrationSettings, VirtualSettings
 from tilestream.store import TileStore
 from tilestream.tables import read_tables, remove_others
@@ -101,7 +101,7 @@ def observe_along(
     out: str | os.PathLike[str],
     *,
     spacing: float = 1.0,
-    sensor: Sensor = VLP16,
+    sensor: Carrier = VLP16,
     seeing: VirtualSettings | None = None,
     registration: RegistrationSettings | None = None,
     sensor_height: float = SENSOR_HEIGHT,

@@ -266,7 +266,7 @@ def _facts(
         "wall time, all calls [s]": book.seconds(),
         "calls": book.calls,
         "map": settings.store_url,
-        "sensor": settings.looking_sensor.name,
+        "sensor": settings.vehicle.name,
         "labelled places": 0 if known is None else len(known),
         "lost labels": {} if known is None else known.losses,
         "model": _model_facts(settings, book),

@@ -19,6 +19,7 @@ from tilestream.pipeline.stages.drive_scans import Reading as DriveReading
 from tilestream.pipeline.stages.observe import Observing
 from tilestream.pipeline.stages.samples import COLUMNS
 from tilestream.records import Route
+from tilestream.sensor import Sensor
 from tilestream.settings import (
     DriveSettings,
     IngestSettings,
@@ -200,7 +201,7 @@ def is_simulated(settings: RunSettings) -> bool:
 def observing_of(settings: RunSettings, seeing: VirtualSettings) -> Observing:
     """What the virtual drive is made with: the vehicle's lidar and its matcher."""
     return Observing(
-        settings.looking_sensor,
+        settings.vehicle,
         seeing,
         settings.label.registration,
         settings.cell_size,
@@ -213,6 +214,9 @@ def observing_drive(
 ) -> Observing:
     """What a drive is observed with: the vehicle's lidar, as far as the drive is read as a lesser
     one; that of the vehicle itself where it is not.
+
+    Raises:
+        UsageError: fewer beams of a vehicle of several sensors.
     """
     vehicle = observing_of(settings, seeing)
     changes: dict[str, float] = {}
@@ -220,7 +224,13 @@ def observing_drive(
         changes["range_max"] = drive.range_max
     if drive.blind_rear_deg is not None and drive.blind_rear_deg > seeing.blind_rear_deg:
         changes["blind_rear_deg"] = drive.blind_rear_deg
-    sensor = vehicle.sensor if drive.beams is None else vehicle.sensor.with_beams(drive.beams)
+    sensor = vehicle.sensor
+    if drive.beams is not None:
+        if not isinstance(sensor, Sensor):
+            raise UsageError(
+                f"drive {drive.group} has beams, of one lidar: the vehicle has several"
+            )
+        sensor = sensor.with_beams(drive.beams)
     return replace(vehicle, sensor=sensor, seeing=seeing.model_copy(update=changes))
 
 
@@ -238,6 +248,7 @@ def degraded_drives(settings: RunSettings, drives: Sequence[DriveSettings]) -> d
 def making_of(settings: RunSettings) -> dict[str, Any]:
     """What the factors are made with, as a model remembers it."""
     making = made_with(COLUMNS, settings.looking_sensor, settings.cell_size)
+    making |= {"sensor": settings.vehicle.model_dump(mode="json")}
     making |= {"sensor_height": settings.sensor_height, "map_leaf": _map_leaf(settings)}
     if settings.observe is None:
         return making

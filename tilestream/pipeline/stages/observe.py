@@ -12,7 +12,7 @@ from tilestream.pipeline.engine.outputs import Made, Parquet
 from tilestream.pipeline.engine.stage import Stage, Task, stage
 from tilestream.pipeline.stages.map_part import MapPart
 from tilestream.pipeline.stages.map_plan import MapPlan
-from tilestream.sensor import Sensor
+from tilestream.sensor import Carrier, rim_of
 from tilestream.settings import RegistrationSettings, VirtualSettings
 
 FIXED_BYTES = 600_000_000
@@ -26,7 +26,7 @@ BYTES_PER_POINT = 60
 class Observing:
     """What is observed with: the identity of a table of observability."""
 
-    sensor: Sensor
+    sensor: Carrier
     """What looks."""
     seeing: VirtualSettings
     """How it sees, and where the virtual drive starts."""
@@ -42,6 +42,11 @@ class Observing:
         """How far it sees [m]."""
         usable = self.seeing.range_max
         return self.sensor.range_max if usable is None else min(usable, self.sensor.range_max)
+
+    @property
+    def reach(self) -> float:
+        """How far from the sample point what it sees can be [m]."""
+        return self.range_max + rim_of(self.sensor)
 
 
 @stage(
@@ -101,7 +106,7 @@ def observe_task(
         applies: `observe`, or `observe_drive`.
     """
     cell_mm = whole_mm(observing.cell_size, "cell_size")
-    seen = plan.over(Box.around(samples.places, observing.range_max + MARGIN))
+    seen = plan.over(Box.around(samples.places, observing.reach + MARGIN))
     made = [task for k in seen for task in (plan.cells(k, cell_mm), plan.surfels(k))]
     return Task(
         applies,
