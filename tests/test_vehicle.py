@@ -162,6 +162,12 @@ def test_a_simulated_scan_is_in_the_frame_of_the_vehicle_too() -> None:
     assert scan.points[:, 0].mean() > 1.0
 
 
+def test_a_simulated_vehicle_has_one_lidar() -> None:
+    with pytest.raises(UsageError, match="one lidar: give one sensor"):
+        LidarSettings(sensor=["VLP16", "HDL64"])
+    assert LidarSettings(sensor={"name": "VLP16", "view_deg": 120.0}).model.view_deg == 120.0
+
+
 # --- As data
 
 

@@ -284,6 +284,11 @@ def sensor_of(given: Any) -> Carrier:
     return Sensor(**(known.model_dump() if known else {}) | dict(given))
 
 
+def named(given: Any) -> Any:
+    """The name of a sensor that ships as it is; anything else as `sensor_of` reads it."""
+    return given if isinstance(given, str) and given in SENSORS else sensor_of(given)
+
+
 def _read(path: str) -> Any:
     """The fields of a sensor, or a list of sensors, in a YAML file."""
     if not Path(path).is_file():

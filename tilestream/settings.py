@@ -8,12 +8,12 @@ The YAML file of a job is `RunSettings`. The options of the command line are mad
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BeforeValidator, Field, field_validator, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from tilestream.config import Settings
 from tilestream.errors import UsageError
 from tilestream.records import TruePose
-from tilestream.sensor import SENSORS, Carrier, Sensor, Vehicle, sensor_of
+from tilestream.sensor import SENSORS, Carrier, Sensor, Vehicle, named
 
 Positive = Annotated[float, Field(gt=0.0)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -289,21 +289,15 @@ class PlaceSettings(Settings):
     """CRS for routes in degrees."""
     spacing: Positive = 1.0
     """Distance between sample points [m]."""
-    sensor: str | Sensor | Vehicle = "VLP16"
-    """The vehicle's lidar: a name (VLP16, HDL64, OS1_128), a YAML file, its fields, or a list of
-    such, each with its mount."""
+    sensor: Annotated[str | Sensor | Vehicle, BeforeValidator(named)] = "VLP16"
+    """The vehicle's lidar: a name that ships, a YAML file, its fields, or a list of these, each
+    with its mount."""
     sensor_height: Annotated[float, Field(ge=0.0, le=10.0)] = 2.0
     """Height of the lidar above the road [m]; with a mount, of the vehicle's origin."""
     cell_size: Positive = 2.0
     """Edge of an NDT cell [m]."""
     memory: Bytes = Field(default="1.5GB", validate_default=True)
     """What one task may use [bytes], also as 512MB or 2GB."""
-
-    @field_validator("sensor", mode="before")
-    @classmethod
-    def _read(cls, sensor: Any) -> Any:
-        known = isinstance(sensor, str) and sensor in SENSORS
-        return sensor if known else sensor_of(sensor)
 
     @property
     def vehicle(self) -> Carrier:
