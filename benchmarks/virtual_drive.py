@@ -61,14 +61,15 @@ from tilestream.factors.observability import (
 )
 from tilestream.factors.surfels import surfel_mm, surfels_in, tile_surfels
 from tilestream.factors.virtual_drive import physics_offset, stratified_starts, virtual_drive
-from tilestream.factors.virtual_scan import Beams, Scene, VirtualSettings, virtual_scan
+from tilestream.factors.virtual_scan import Beams, Scene, virtual_scan
 from tilestream.formats.logs import open_log
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.formats.routes import route_of
 from tilestream.grid import MM_PER_M
 from tilestream.kernels.virtual_scan import cast
 from tilestream.pipeline.jobs.along_routes import observe_along
-from tilestream.pipeline.jobs.run_settings import DriveSettings, RunSettings, read_settings
+from tilestream.pipeline.jobs.run_settings import read_settings
+from tilestream.settings import DriveSettings, RunSettings, VirtualSettings
 
 BINS = (0.0, 5.0, 10.0, 20.0, 30.0, 50.0, 100.0)
 """Ranges by which scans are compared [m]."""
@@ -127,7 +128,7 @@ def cost(folder: Path, spacing: float) -> pd.DataFrame:
         return Scene.of(near, whole_places(places), edge_mm)
 
     made = scene()
-    scan = virtual_scan(made, place_mm, heading, ts.VLP16, seeing, beams)
+    scan = virtual_scan(made, place_mm, heading, seeing, beams)
     T_map_lidar = upright(place_mm, heading)
     points = len(store.tile(key).points())
     rows = [
@@ -141,7 +142,7 @@ def cost(folder: Path, spacing: float) -> pd.DataFrame:
         (
             "scan",
             f"{len(beams.direction)} beams, {len(scan.points)} returns",
-            cpu_ms(lambda: virtual_scan(made, place_mm, heading, ts.VLP16, seeing, beams)),
+            cpu_ms(lambda: virtual_scan(made, place_mm, heading, seeing, beams)),
         ),
     ]
     for name, settings in MATCHERS.items():

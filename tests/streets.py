@@ -8,7 +8,7 @@ from logs import SECOND, START, pose
 from scenes import PLACES, in_map
 
 from tilestream.formats.points.pcd import write_pcd
-from tilestream.pipeline.jobs.run_settings import RunSettings
+from tilestream.settings import RunSettings
 
 STREETS = {"canyon": 0.0, "tunnel": 400.0, "crossing": 800.0}
 """Kind of each street, and where it begins [m, map x]."""

@@ -12,9 +12,11 @@ import tilestream
 ROOT = Path(tilestream.__file__).parent
 FLOORS = (
     ("errors", "version"),
-    ("grid", "settings", "marks"),
-    ("kernels", "sensor"),
+    ("config", "grid", "marks"),
+    ("kernels",),
+    ("sensor",),
     ("records",),
+    ("settings",),
     ("ndt",),
     ("store", "tables", "formats", "simulation"),
     ("registration",),

@@ -24,7 +24,6 @@ from scipy.spatial.transform import Rotation
 import tilestream as ts
 from tilestream.cli import run
 from tilestream.cli.app import COMMANDS, command_of
-from tilestream.cli.options import parse_bytes
 from tilestream.cli.progress import progress
 from tilestream.errors import UsageError
 from tilestream.formats.logs import open_log
@@ -32,6 +31,8 @@ from tilestream.formats.points.las import write_las
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.cluster import TlsFiles
+from tilestream.pipeline.jobs.run_inputs import inputs_of, read_map
+from tilestream.settings import RunSettings, bytes_of
 
 Told = pytest.CaptureFixture[str]
 
@@ -99,7 +100,7 @@ def test_help_names_every_command(capsys: Told) -> None:
         assert run([command, "--help"]) == 0
         assert "Usage" in capsys.readouterr().out
     assert run(["ingest", "--help"]) == 0
-    assert "Edge of a tile [m]." in capsys.readouterr().out
+    assert "Edge of a tile [m]" in capsys.readouterr().out
 
 
 def test_the_list_of_commands_says_what_each_says_of_itself() -> None:
@@ -208,11 +209,11 @@ def test_a_full_disk_is_told_in_one_line(
 
 
 def test_amounts_of_memory() -> None:
-    assert parse_bytes("512MB") == 512_000_000
-    assert parse_bytes(" 1.5 gb ") == 1_500_000_000
+    assert bytes_of("512MB") == 512_000_000
+    assert bytes_of(" 1.5 gb ") == 1_500_000_000
     for wrong in ("512", "MB", "many GB", "nan GB", "inf MB", "-1GB", "0MB"):
         with pytest.raises(UsageError, match="memory"):
-            parse_bytes(wrong)
+            bytes_of(wrong)
 
 
 # --- Where the tasks run
@@ -380,6 +381,21 @@ def test_a_log_becomes_a_map(log: Path, tmp_path: Path, capsys: Told) -> None:
     assert f"mcap, {count:,} points" in shown
 
 
+def test_a_part_of_a_log_becomes_a_map(log: Path, tmp_path: Path, capsys: Told) -> None:
+    """The scans are a second apart: two of the six lie in these two seconds."""
+    part = ["--from-s", "2", "--until-s", "4"]
+    assert run(["ingest", str(log), "--store", str(tmp_path / "map.zarr"), *part]) == 0
+    count = sum(len(scan.points) for scan in open_log(log).scans_at([2, 3]))
+    assert f"mcap, {count:,} points" in capsys.readouterr().out
+    how = {"sources": (str(log),), "from_s": 2.0, "until_s": 4.0}
+    job = RunSettings(out=str(tmp_path / "run"), map=how, drives=[{"log": str(log)}])
+    reading = read_map(job, inputs_of(job, None, None))
+    assert reading is not None
+    (source,) = reading.found
+    assert source.info is not None
+    assert source.info.points == count
+
+
 def test_a_log_cut_short_is_recovered_and_the_loss_reported(
     log: Path, tmp_path: Path, capsys: Told
 ) -> None:
@@ -520,6 +536,7 @@ def test_localize_prints_the_errors(log: Path, store: str, tmp_path: Path, capsy
     assert run(["localize", store, str(log), *few, "--until-s", "5"]) == 0
     shown = capsys.readouterr().out
     assert re.search(r" 5 +sample points", shown)
+    assert re.search(r" autoware +the matcher", shown)
     assert re.search(r" \d+\.\d cm +mean error", shown)
     assert shown.count("of the worst places") == 3
     assert "mean_m" not in shown
@@ -533,6 +550,7 @@ def test_localize_prints_the_errors(log: Path, store: str, tmp_path: Path, capsy
         ts.open_store(store), log, tmp_path / "again", starts=ts.StartSettings(radius=0.4)
     )
     assert (facts["sample_points"], facts["failed"]) == (6, 1)
+    assert facts["matcher"] == "autoware"
     assert facts["mean_m"] == pytest.approx(labels["error_mean"].mean())
     assert facts["max_m"] == labels["error_mean"].max()
     assert facts["share_over_0.10_m"] == (labels["error_mean"].dropna() > 0.1).mean()
@@ -576,10 +594,10 @@ def test_a_folder_that_is_a_file_is_refused_at_once(
     ("wrong", "says"),
     [
         (["--spacing", "0"], "spacing"),
-        (["--max-range", "-1"], "range_max"),
-        (["--blind-rear", "400"], "blind_rear"),
+        (["--range-max", "-1"], "range_max"),
+        (["--blind-rear-deg", "400"], "blind_rear"),
         (["--beams", "0"], "beams"),
-        (["--sweep", "0"], "sweep"),
+        (["--sweep-s", "0"], "sweep"),
         (["--step", "0"], "step"),
         (["--cell-size", "3"], "cell_size"),
         (["--scan-leaf", "-1"], "scan_leaf"),

@@ -18,13 +18,13 @@ import tilestream as ts
 from tilestream.apps.compare import Choice, choices_of, compare, plan_compare
 from tilestream.cli import run
 from tilestream.errors import UsageError
-from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.formats.routes import route_of
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY
 from tilestream.pipeline.jobs.along_routes import observe_along
 from tilestream.report import write_comparison
 from tilestream.report.comparison import CELL_BYTES, Comparison
+from tilestream.settings import VirtualSettings
 from tilestream.store import cells_table
 from tilestream.tables import read_tables
 
@@ -302,10 +302,12 @@ def test_the_command_compares_and_explains_itself(
         "short-8m-cell2m",
         "short-12m-cell2m",
     ]
+    assert told["facts"]["matcher"] == "autoware"
     assert (tmp_path / "out" / "compare.html").is_file()
     assert run([*line, "--spacing", "16"]) == 0
     shown = capsys.readouterr().out
     assert "short-12m-cell2m" in shown
+    assert "matcher autoware" in shown
     assert "compare.html" in shown
     for wrong, why in (
         (["--cell-size", "2.0,3.0"], "sizes that fit are .* 1, .* 2, .* fit tiles of 18 m"),

@@ -3,8 +3,9 @@
 import pytest
 
 import tilestream as ts
+from tilestream.config import Settings
 from tilestream.errors import TilestreamError, UsageError
-from tilestream.settings import IngestSettings, RegistrationSettings, Settings
+from tilestream.settings import IngestSettings, RegistrationSettings
 
 
 class Job(Settings):

@@ -34,7 +34,6 @@ from tilestream.errors import (
     SourceNotFoundError,
     UsageError,
 )
-from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.model import evaluation, models, training
 from tilestream.model.dataset import TARGETS
 from tilestream.model.intervals import coverage
@@ -48,9 +47,16 @@ from tilestream.pipeline.engine.outputs import TileArrays
 from tilestream.pipeline.engine.stage import Task
 from tilestream.pipeline.jobs import run as main_job
 from tilestream.pipeline.jobs.forecast import forecast
+from tilestream.pipeline.jobs.run_book import Book
 from tilestream.pipeline.jobs.run_inputs import check_model, inputs_of, making_of
 from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
-from tilestream.pipeline.jobs.run_settings import (
+from tilestream.pipeline.jobs.run_settings import read_settings
+from tilestream.pipeline.stages import predict as predict_stage
+from tilestream.pipeline.stages.map_plan import MapPlan
+from tilestream.pipeline.stages.terms import terms
+from tilestream.report import pictures
+from tilestream.report.evaluation import MODELS
+from tilestream.settings import (
     DriveSettings,
     LabelSettings,
     MapSettings,
@@ -58,13 +64,8 @@ from tilestream.pipeline.jobs.run_settings import (
     ReportSettings,
     RunSettings,
     SimulateSettings,
-    read_settings,
+    VirtualSettings,
 )
-from tilestream.pipeline.stages import predict as predict_stage
-from tilestream.pipeline.stages.map_plan import MapPlan
-from tilestream.pipeline.stages.terms import terms
-from tilestream.report import pictures
-from tilestream.report.evaluation import MODELS
 from tilestream.simulation.settings import load_preset
 
 PIPELINES = Path(__file__).resolve().parents[1] / "pipelines"
@@ -669,7 +670,7 @@ def test_a_file_that_is_not_there_is_named_and_nothing_is_measured(
 
 
 def test_where_run_json_cannot_be_written_the_reason_is_told_all_the_same(tmp_path: Path) -> None:
-    book = main_job._Book(tmp_path / "gone")
+    book = Book(tmp_path / "gone")
     with pytest.raises(ValueError, match="why it ended"), book.closed():
         raise ValueError("why it ended")
 

@@ -29,12 +29,13 @@ from tilestream.factors.virtual_drive import (
     virtual_drive,
     weighted_median,
 )
-from tilestream.factors.virtual_scan import Beams, Scene, VirtualSettings, cast
+from tilestream.factors.virtual_scan import Beams, Scene, cast
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.grid import Box
 from tilestream.label import localization_error
 from tilestream.marks import Mark
 from tilestream.registration import register
+from tilestream.settings import VirtualSettings
 from tilestream.store import POINTS, Tile
 
 SENSOR = ts.VLP16.model_copy(update={"name": "short", "range_max": 15.0, "azimuth_step_deg": 3.0})

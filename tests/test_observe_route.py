@@ -14,7 +14,6 @@ import tilestream as ts
 from tilestream.errors import PlanError, UsageError
 from tilestream.factors.observability import observability
 from tilestream.factors.rows import samples_by_tile
-from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.formats.routes import route_of
 from tilestream.marks import Mark
@@ -23,6 +22,7 @@ from tilestream.pipeline.engine.plan import DEFAULT_MEMORY
 from tilestream.pipeline.jobs.along_routes import observe_along, plan_observe
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.observe import Observing
+from tilestream.settings import VirtualSettings
 from tilestream.store import POINTS, Tile
 
 SENSOR = ts.VLP16.model_copy(update={"name": "short", "azimuth_step_deg": 3.0})
@@ -62,7 +62,8 @@ def test_rows_follow_the_route_and_say_what_is_observed_from_their_places(
     np.testing.assert_array_equal(table[["x", "y", "z"]], points.positions)
     np.testing.assert_array_equal(table["heading"], points.heading)
     assert (table["status"] == "done").all(), table["reason"].tolist()
-    direct = observability(store, points.positions, points.heading, SENSOR, SEEING)
+    matcher = ts.RegistrationSettings.autoware()
+    direct = observability(store, points.positions, points.heading, SENSOR, SEEING, matcher)
     pd.testing.assert_frame_equal(
         table[direct.columns.tolist()], direct, check_dtype=False, check_exact=True
     )
@@ -101,8 +102,8 @@ def test_what_is_done_is_not_done_again_and_other_settings_are(
     pd.testing.assert_frame_equal(work(), first, check_exact=True)
     there = (first["x"] < 20.0) & (first["y"] < 0.0)
     assert rows_made(results) == there.sum() > 0
-    raw = ts.RegistrationSettings.autoware()
-    assert work(registration=raw)["vd_mean"].tolist() != first["vd_mean"].tolist()
+    ours = ts.RegistrationSettings()
+    assert work(registration=ours)["vd_mean"].tolist() != first["vd_mean"].tolist()
     blind = SEEING.model_copy(update={"blind_rear_deg": 180.0})
     assert work(seeing=blind)["ob_points"].mean() < 0.8 * first["ob_points"].mean()
 
@@ -116,7 +117,7 @@ def test_every_column_and_every_setting_is_in_the_file(table: pd.DataFrame, stre
     data_set = json.loads(schema.metadata[b"tilestream"])["facts"]["data_set"]
     assert data_set["sensor"]["name"] == "short"
     assert data_set["seeing"]["range_max"] == 15.0
-    assert data_set["registration"]["solver"] == "definite"
+    assert data_set["registration"]["solver"] == "raw"
     assert data_set["cell_size"] == 2.0
 
 

@@ -54,7 +54,7 @@ def test_the_drive_block_runs(
 ) -> None:
     (tmp_path / "drive.mcap").symlink_to(shared_data / "kitti_drive" / "drive.mcap")
     monkeypatch.chdir(tmp_path)
-    text = block("--blind-rear").replace("\\\n", " ")
+    text = block("--blind-rear-deg").replace("\\\n", " ")
     for line in text.strip().splitlines():
         program, *arguments = line.split()
         assert program == "tilestream"
@@ -96,7 +96,7 @@ def over(limit: float) -> bool:
 
 
 def test_no_block_is_left_out() -> None:
-    ran = {"import tilestream as ts", "--blind-rear", "tilestream template"}
+    ran = {"import tilestream as ts", "--blind-rear-deg", "tilestream template"}
     setups = {"tilestream demo", "pytest"}
     for _, text in BLOCKS:
         assert sum(part in text for part in ran | setups) == 1

@@ -21,7 +21,6 @@ from tilestream.factors.virtual_scan import (
     Beams,
     Scene,
     VirtualScan,
-    VirtualSettings,
     draws,
     first_returns,
     near_share,
@@ -35,6 +34,7 @@ from tilestream.kernels.depth_image import thin
 from tilestream.kernels.surfels import NORMAL_ONE, surfels_of
 from tilestream.kernels.virtual_scan import cast
 from tilestream.marks import Mark
+from tilestream.settings import VirtualSettings
 
 Floats = np.ndarray
 EDGE = 200
@@ -56,13 +56,19 @@ def surfels_from(points: Floats) -> Surfels:
     return Surfels(*surfels_of(thin(index, sums, EDGE), index, EDGE, own))
 
 
+def scene_of(points: Floats, place_mm: Floats, rim: float = 0.0) -> Scene:
+    """The scene of points [m] for sensors within `rim` [m] of a place."""
+    around = np.array([place_mm - round(rim * 1000), place_mm + round(rim * 1000)])
+    return Scene.of(surfels_from(points), around, EDGE)
+
+
 def scan_at(
     points: Floats, place: Floats, heading: float = 0.0, seeing: VirtualSettings = CLEAN
 ) -> tuple[VirtualScan, Beams]:
     """What `FEW` sees in points [m] from a place."""
     place_mm, beams = np.rint(np.array(place) * 1000).astype(np.int64), Beams.of(FEW, seeing)
-    scene = Scene.of(surfels_from(points), place_mm[None], EDGE)
-    return virtual_scan(scene, place_mm, heading, FEW, seeing, beams), beams
+    scene = scene_of(points, place_mm)
+    return virtual_scan(scene, place_mm, heading, seeing, beams), beams
 
 
 def sheet(rng: np.random.Generator, length: float, width: float, spacing: float = 0.2) -> Floats:

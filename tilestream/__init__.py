@@ -24,7 +24,6 @@ from typing import TYPE_CHECKING, Any
 from tilestream.factors.observability import observability as observability
 from tilestream.factors.sample_points import sample_points as sample_points
 from tilestream.factors.table import factors as factors
-from tilestream.factors.virtual_scan import VirtualSettings as VirtualSettings
 from tilestream.formats.logs import ScanSelection as ScanSelection
 from tilestream.formats.routes import read_route as read_route
 from tilestream.formats.routes import read_routes as read_routes
@@ -48,7 +47,9 @@ from tilestream.sensor import OS1_128 as OS1_128
 from tilestream.sensor import VLP16 as VLP16
 from tilestream.sensor import Sensor as Sensor
 from tilestream.settings import RegistrationSettings as RegistrationSettings
+from tilestream.settings import RunSettings as RunSettings
 from tilestream.settings import StartSettings as StartSettings
+from tilestream.settings import VirtualSettings as VirtualSettings
 from tilestream.store import Tile as Tile
 from tilestream.store import TileStore as TileStore
 from tilestream.store import open_store as open_store
@@ -59,7 +60,6 @@ if TYPE_CHECKING:
     from tilestream.definitions import explain as explain
     from tilestream.pipeline.jobs.run import dataset as dataset
     from tilestream.pipeline.jobs.run import run as run
-    from tilestream.pipeline.jobs.run_settings import RunSettings as RunSettings
 
 
 def __getattr__(name: str) -> Any:
@@ -72,8 +72,6 @@ def __getattr__(name: str) -> Any:
         return import_module("tilestream.apps.view").view
     if name == "explain":
         return import_module("tilestream.definitions").explain
-    if name == "RunSettings":
-        return import_module("tilestream.pipeline.jobs.run_settings").RunSettings
     raise AttributeError(f"module 'tilestream' has no attribute {name!r}")
 
 

@@ -17,12 +17,12 @@ from typing import Any, Literal, get_args
 from pydantic import TypeAdapter
 from pydantic.fields import FieldInfo
 
+from tilestream.config import Settings
 from tilestream.errors import UsageError
 from tilestream.factors import catalogue, observability
 from tilestream.factors.rows import PLACE_COLUMNS, STATUS_COLUMNS
 from tilestream.model.dataset import TARGETS, features_of
 from tilestream.model.training import PREDICTION_COLUMNS
-from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.stages.evaluate import JUDGED_COLUMNS
 from tilestream.pipeline.stages.importance import WEIGHT_COLUMNS
 from tilestream.pipeline.stages.label import ERROR_COLUMNS
@@ -30,7 +30,7 @@ from tilestream.pipeline.stages.register import START_COLUMNS
 from tilestream.pipeline.stages.samples import COLUMNS as ALL_FACTORS
 from tilestream.pipeline.stages.samples import DATASET_COLUMNS, LOST_COLUMNS
 from tilestream.records import Column
-from tilestream.settings import Settings
+from tilestream.settings import RunSettings
 from tilestream.simulation.settings import SimulationSettings
 
 TABLES: dict[str, tuple[Column, ...]] = {

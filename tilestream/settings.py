@@ -1,55 +1,69 @@
-"""Settings: frozen pydantic models; unknown keys refused.
+"""Every knob of the jobs, once: name, unit, meaning and default.
 
-The docstring of a field is its documentation: meaning, and the unit in brackets. `tilestream
-explain` prints it.
+The YAML file of a job is `RunSettings`. The options of the command line are made from these fields
+(`cli/fields.py`), and the keywords of the Python jobs have the same names and defaults
+(tests/test_settings.py). The simulated city has a file of its own (`simulation/settings.py`).
 """
 
-import difflib
-import re
-from collections.abc import Iterator
-from typing import Any, Literal, Self
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BeforeValidator, Field, model_validator
 
+from tilestream.config import Settings
 from tilestream.errors import UsageError
+from tilestream.records import TruePose
+from tilestream.sensor import SENSORS, Carrier, Sensor, Vehicle, named
 
-NESTED = re.compile(r" \w+Settings: ")
-"""How settings inside others begin what is wrong with them: the key above says which they are."""
+Positive = Annotated[float, Field(gt=0.0)]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Degrees = Annotated[float, Field(ge=0.0, lt=360.0)]
+Name = Annotated[str, Field(pattern=r"^[\w][\w .+-]*$")]
+"""Of a drive: it becomes a folder, so nothing that could lead out of one."""
 
 
-class Settings(BaseModel):
-    """Base of all settings: frozen; an unknown key is an error at every level.
+def bytes_of(amount: object) -> object:
+    """`512MB` or `2GB` as bytes (powers of ten); what is no text stays as it is.
 
     Raises:
-        UsageError: a value that cannot be; names each key and what is wrong with it.
+        UsageError: a text that is not of that form.
+    """
+    if not isinstance(amount, str):
+        return amount
+    text = amount.strip().upper()
+    for unit, factor in (("KB", 10**3), ("MB", 10**6), ("GB", 10**9), ("TB", 10**12)):
+        number = text.removesuffix(unit)
+        if number != text:
+            try:
+                count = int(float(number) * factor)
+            except (ValueError, OverflowError):
+                break
+            if count > 0:
+                return count
+    raise UsageError(f"{amount!r} is no amount of memory: give a form like 512MB or 2GB")
+
+
+Bytes = Annotated[int, BeforeValidator(bytes_of), Field(gt=0)]
+"""An amount of memory, as a number or as `1.5GB`."""
+
+
+class LogSettings(Settings):
+    """Which scans of a log are used. Two choices with the same `every` and another `offset`, or one
+    `until_s` and the other `from_s` the same time, share no scan: one maps, one localizes.
     """
 
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
-    )
-
-    def __init__(self, **values: Any) -> None:
-        try:
-            super().__init__(**values)
-        except ValidationError as error:
-            raise UsageError(
-                f"{type(self).__name__}: "
-                + "; ".join(_readable(error, list(type(self).model_fields)))
-            ) from None
-
-
-def _readable(error: ValidationError, known: list[str]) -> Iterator[str]:
-    for problem in error.errors():
-        key = ".".join(str(part) for part in problem["loc"])
-        if problem["type"] == "extra_forbidden":
-            near = difflib.get_close_matches(key, known, n=1)
-            hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
-            yield f"{key} is no setting: {hint}"
-        elif problem["type"] == "value_error":
-            said = problem["msg"].removeprefix("Value error, ")
-            yield NESTED.sub(": ", f"{key} {said}").strip()
-        else:
-            yield f"{key} is {problem['input']!r}: {problem['msg']}"
+    every: Annotated[int, Field(ge=1)] = 1
+    """Use every n-th scan of a log …"""
+    offset: Annotated[int, Field(ge=0)] = 0
+    """… from this one on: another offset uses other scans."""
+    from_s: Annotated[float, Field(ge=0.0)] = 0.0
+    """Use the scans of a log from this time on [s after its first]."""
+    until_s: Positive | None = None
+    """Use the scans of a log before this time [s after its first]; not given: to the end."""
+    points_topic: str | None = None
+    """Topic of the scans in a log; not given: found by type."""
+    pose_topic: str | None = None
+    """Topic of the poses in a log; not given: found by type."""
 
 
 class IngestSettings(Settings):
@@ -62,7 +76,50 @@ class IngestSettings(Settings):
     map_leaf: float = 0.2
     """Edge of the voxels that the map is thinned to, one centroid each [m]; 0 keeps all points."""
     crs: str | None = None
-    """CRS of the map, any string that pyproj reads; None: that of the sources."""
+    """CRS of the map, any string that pyproj reads; not given: that of the sources."""
+
+
+class MapSettings(IngestSettings, LogSettings):
+    """The map: what it is made from, and how it is cut into tiles."""
+
+    sources: tuple[str, ...] = ()
+    """Files, globs and map directories; empty with `simulate`: its survey."""
+    store: str | None = None
+    """Path or URL of the tile store; not given: `map.zarr` in the run directory."""
+
+
+class DriveSettings(LogSettings):
+    """A log on which errors are measured, maybe through a degraded sensor."""
+
+    log: str
+    """An MCAP log with point clouds and poses."""
+    name: Name | None = None
+    """What to call it; not given: the name of its file. Give each drive its own."""
+    beams: Annotated[int, Field(ge=1)] | None = None
+    """As if by a lidar of so many beams; not given: as recorded."""
+    range_max: Positive | None = None
+    """As if by one of this range [m]; not given: as recorded."""
+    blind_rear_deg: Degrees | None = None
+    """As if blind in this sector to the rear [deg]; not given: as recorded."""
+    deskew: bool = False
+    """Remove the distortion of motion first."""
+    sweep_s: Positive | None = None
+    """Duration of a turn [s], for logs without the time of each point."""
+
+    @property
+    def group(self) -> str:
+        """The name of its labels."""
+        return self.name or Path(self.log).stem
+
+    @property
+    def degraded(self) -> str:
+        """As if by which lidar it is read, e.g. `16beams-30m-rear120`; empty: as recorded."""
+        parts = (
+            f"{self.beams}beams" if self.beams else "",
+            f"{self.range_max:.10g}m" if self.range_max else "",
+            f"rear{self.blind_rear_deg:.10g}" if self.blind_rear_deg else "",
+        )
+        return "-".join(part for part in parts if part)
 
 
 class RegistrationSettings(Settings):
@@ -108,6 +165,25 @@ class RegistrationSettings(Settings):
         }
         return cls(**(preset | changes))
 
+    @property
+    def told(self) -> str:
+        """The matcher in words: the preset that is nearest to it, and what it has otherwise."""
+        own = self.model_dump()
+        others = {
+            name: {key: own[key] for key, value in known.model_dump().items() if own[key] != value}
+            for name, known in MATCHERS.items()
+        }
+        name = min(others, key=lambda name: len(others[name]))
+        changes = ", ".join(f"{key} {value}" for key, value in others[name].items())
+        return f"{name}, but {changes}" if changes else name
+
+
+MATCHERS = {
+    "autoware": RegistrationSettings.autoware(),
+    "default": RegistrationSettings(),
+}
+"""The matchers that have a name: that of production, and ours."""
+
 
 class StartSettings(Settings):
     """The starts around a true pose: the paper's initial guess particles (its section VI)."""
@@ -120,3 +196,167 @@ class StartSettings(Settings):
     """Turns about the map's z axis; every start is tried with each [rad]."""
     z: tuple[float, ...] = Field(default=(0.0,), min_length=1)
     """Offsets in map z; every start is tried with each [m]."""
+
+
+class VirtualSettings(Settings):
+    """How a vehicle sees with its sensor, and how it is started in the virtual drive."""
+
+    range_max: Positive | None = None
+    """Usable range [m], no more than the sensor's; not given: the sensor's."""
+    range_min: Annotated[float, Field(ge=0.0)] = 0.9
+    """Surfels nearer than this are ignored: the vehicle itself is there [m]."""
+    blind_rear_deg: Degrees = 0.0
+    """Sector to the rear that the vehicle hides [deg]."""
+    fading_from: Share = 0.6
+    """Share of the usable range beyond which returns are lost …"""
+    fading: Share = 0.6
+    """… up to this share of them at its end, linearly."""
+    grazing_deg: Annotated[float, Field(gt=0.0, lt=90.0)] = 75.0
+    """Angle of incidence beyond which returns are lost, more as its cosine falls to 0 [deg]."""
+    without_ghosts: bool = True
+    """Whether traffic that the survey recorded is left out of the scan (ghosts); some thin objects
+    such as posts are left out with it."""
+    starts: Annotated[int, Field(ge=8)] | None = 64
+    """Starts of the virtual drive, spread over the disc of starts; null: all of them."""
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    """Seed of noise and drop-outs; the place is part of it too."""
+
+
+class LabelSettings(Settings):
+    """How errors are measured: the matcher decides them (definitions, section 5)."""
+
+    matcher: Literal["default", "autoware"] | RegistrationSettings = "autoware"
+    """The matcher: `autoware` (production, the paper's kind), `default` (ours), or its settings."""
+    starts: StartSettings = StartSettings()
+    """Where registrations start."""
+    true_pose: TruePose = "log"
+    """The true pose: as the log has it, or refined as the paper does."""
+
+    @property
+    def registration(self) -> RegistrationSettings:
+        """The matcher's settings."""
+        return MATCHERS[self.matcher] if isinstance(self.matcher, str) else self.matcher
+
+
+class SimulateSettings(Settings):
+    """A simulated city instead of real files: its survey is the map, its drives are measured."""
+
+    city: Literal["shinjuku"] = "shinjuku"
+    """The city that ships with tilestream."""
+    preset: str = "physical"
+    """`physical`, `paper`, or a YAML file of simulation settings."""
+    size: Literal["full", "small"] = "full"
+    """`small`: the first 40 m of each path, and a thin survey."""
+    drives: Annotated[int, Field(ge=1, le=16)] = 1
+    """Drives of each path; from the second on they show how much any estimate can know."""
+    paths: tuple[str, ...] | None = None
+    """Only these streets; not given: all."""
+    scans_per_point: Annotated[int, Field(ge=1, le=64)] = 1
+    """Turns of the lidar kept at each sample point."""
+    seed: int = 0
+    """Seed of everything that is simulated."""
+    folder: str | None = None
+    """Where it is kept; not given: `simulation` in the run directory."""
+
+
+class ModelSettings(Settings):
+    """How the errors of the measured places become those of all places."""
+
+    recipe: Literal["default", "paper", "physics"] = "default"
+    """Ours, tuned on held-out blocks; the paper's forest; or no forest and no training: the virtual
+    drive as it is."""
+    offset: Annotated[float, Field(ge=0.0)] = 0.0
+    """With `physics`: what a real scan adds to the error of a virtual one [m]."""
+    use: str | None = None
+    """A model file to use instead of training; not given: train on the drives."""
+    seed: int = 0
+    """Seed of the forests."""
+
+
+class ReportSettings(Settings):
+    """What the report points out."""
+
+    threshold: Positive = 0.25
+    """Estimates above this are listed as segments [m]."""
+    title: str | None = None
+    """Its title; not given: the name of the run directory."""
+
+
+class PlaceSettings(Settings):
+    """Where a job looks from, and the vehicle that looks."""
+
+    project_to: str | None = None
+    """CRS for routes in degrees."""
+    spacing: Positive = 1.0
+    """Distance between sample points [m]."""
+    sensor: Annotated[str | Sensor | Vehicle, BeforeValidator(named)] = "VLP16"
+    """The vehicle's lidar: a name that ships, a YAML file, its fields, or a list of these, each
+    with its mount."""
+    sensor_height: Annotated[float, Field(ge=0.0, le=10.0)] = 2.0
+    """Height of the lidar above the road [m]; with a mount, of the vehicle's origin."""
+    cell_size: Positive = 2.0
+    """Edge of an NDT cell [m]."""
+    memory: Bytes = Field(default="1.5GB", validate_default=True)
+    """What one task may use [bytes], also as 512MB or 2GB."""
+
+    @property
+    def vehicle(self) -> Carrier:
+        """The data of its sensor, or sensors."""
+        return SENSORS[self.sensor] if isinstance(self.sensor, str) else self.sensor
+
+    @property
+    def looking_sensor(self) -> Sensor:
+        """The sensor as which the paper's factors look: the first."""
+        return self.vehicle.sensors[0]
+
+
+class RunSettings(PlaceSettings):
+    """The main job: from map and drives to the estimated error of every sample point."""
+
+    out: str
+    """The run directory."""
+    simulate: SimulateSettings | None = None
+    """Simulate a city; null: real files."""
+    map: MapSettings = MapSettings()
+    """The map."""
+    drives: tuple[DriveSettings, ...] = ()
+    """The logs to measure on; empty with `simulate`: its drives."""
+    routes: tuple[str, ...] = ()
+    """Files of routes to estimate along; empty: those of the simulation, or of the drives; without
+    drives, all lanes of a map directory with `lanelet2_map.osm` among the sources."""
+    observe: VirtualSettings | None = VirtualSettings()
+    """How the vehicle's lidar sees in the virtual drive: usable range, blind sector, starts; null:
+    no virtual drive, the paper's factors and their twins only."""
+    label: LabelSettings = LabelSettings()
+    """How errors are measured."""
+    model: ModelSettings = ModelSettings()
+    """How they are estimated."""
+    report: ReportSettings = ReportSettings()
+    """What is reported."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        names = [drive.group for drive in self.drives]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"has two drives named {', '.join(twice)}: give each its own name")
+        if self.simulate is None and not self.map.sources and self.map.store is None:
+            raise ValueError("has no map: give map.sources (files), map.store, or simulate")
+        physics = self.model.recipe == "physics"
+        if not (self.simulate or self.drives or self.model.use or physics):
+            raise ValueError("has nothing to learn from: give drives, simulate, or model.use")
+        if physics and (self.observe is None or self.model.use):
+            raise ValueError("has model.recipe physics, which needs observe and no model.use")
+        if not (self.simulate or self.drives or self.routes or self.map.sources):
+            raise ValueError("has no routes: give files of routes, or drives")
+        return self
+
+    @property
+    def folder(self) -> Path:
+        """The run directory."""
+        return Path(self.out)
+
+    @property
+    def store_url(self) -> str:
+        """Where the tile store is."""
+        return self.map.store or str(self.folder / "map.zarr")

@@ -15,7 +15,6 @@ import pandas as pd
 
 from tilestream.errors import PartialError, UsageError
 from tilestream.factors.rows import in_route_order, samples_by_tile
-from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.grid import MM_PER_M, whole_mm
 from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, paths_of
@@ -25,8 +24,8 @@ from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.observe import Observing, observe
 from tilestream.records import Route
 from tilestream.report.comparison import CELL_COLUMNS, ROW_COLUMNS, USUAL, Comparison
-from tilestream.sensor import Sensor
-from tilestream.settings import RegistrationSettings
+from tilestream.sensor import Carrier
+from tilestream.settings import LabelSettings, RegistrationSettings, VirtualSettings
 from tilestream.store import TileStore, cells_table
 from tilestream.tables import read_tables, remove_others
 
@@ -46,7 +45,7 @@ class Choice:
         UsageError: a range beyond the sensor's, a blind sector or cell size that cannot be.
     """
 
-    sensor: Sensor
+    sensor: Carrier
     """What looks."""
     range_max: float | None = None
     """Usable range [m]; None: the sensor's."""
@@ -88,7 +87,7 @@ class Choice:
 
 
 def choices_of(
-    sensors: Sequence[Sensor],
+    sensors: Sequence[Carrier],
     ranges: Sequence[float | None],
     blind_rears_deg: Sequence[float],
     cell_sizes: Sequence[float],
@@ -125,7 +124,7 @@ def compare(
             fsspec URL; other tables of these choices there are removed.
         choices: what is compared, at least one, no two of one name.
         spacing: distance between sample points [m].
-        registration: the matcher of the vehicle; default `RegistrationSettings()`.
+        registration: the matcher of the vehicle; default `autoware`, as of all jobs.
         sensor_height: height of the lidar above the route or the ground [m].
         seeing: drop-outs, starts, seed; its range and blind sector give way to each choice's.
         client: a Dask client to run on; None: this process.
@@ -142,7 +141,7 @@ def compare(
         PlanError: a task does not fit `memory`.
         PartialError: some tasks failed; the message lists them, the rest is done.
     """
-    routes, registration = list(routes), registration or RegistrationSettings()
+    routes, registration = list(routes), registration or LabelSettings().registration
     seeing = seeing or VirtualSettings()
     plan = plan_compare(
         store, routes, out, choices, spacing, registration, sensor_height, seeing, memory
@@ -167,6 +166,7 @@ def compare(
         "tile_size": store.settings.tile_size,
         "spacing": spacing,
         "sensor_height": sensor_height,
+        "matcher": registration.told,
         **{f"registration.{name}": value for name, value in registration.model_dump().items()},
         **{f"seeing.{name}": value for name, value in seeing.model_dump(exclude=own).items()},
     }

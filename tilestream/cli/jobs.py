@@ -9,6 +9,7 @@ import pandas as pd
 import typer
 
 from tilestream.cli.cluster import ALL_CORES, HERE, AllCores, Cluster, on_cluster
+from tilestream.cli.fields import fields, with_settings
 from tilestream.cli.options import AsJson, Changes, Config, DryRun
 from tilestream.cli.printing import err, out, print_json, say
 from tilestream.cli.progress import progress
@@ -17,11 +18,13 @@ from tilestream.errors import LimitError
 from tilestream.pipeline.jobs import run as main_job
 from tilestream.pipeline.jobs import simulate as simulation
 from tilestream.pipeline.jobs.forecast import forecast
-from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
+from tilestream.pipeline.jobs.run_inputs import extent
+from tilestream.pipeline.jobs.run_settings import read_settings
 from tilestream.pipeline.stages.simulated import SCENE_BYTES
 from tilestream.report import cards, gate
 from tilestream.report.segments import MISSING, check_threshold
-from tilestream.simulation.settings import load_preset
+from tilestream.settings import RunSettings, SimulateSettings
+from tilestream.simulation.settings import SimulationSettings, load_preset
 
 SHIPPED = resources.files("tilestream") / "data"
 
@@ -77,6 +80,7 @@ def show_report(folder: Path) -> None:
     """Print the headline of a report and where it is."""
     report = report_of(folder)
     out.print(report_table(report, cards(report)))
+    say(f"The matcher is {report['facts']['matcher']['name']}")
     for line in lost_labels(folder):
         say(line)
     say(f"The report is at {(folder / 'report' / 'index.html').absolute()}")
@@ -126,32 +130,25 @@ def plan(
 
 
 @on_cluster
+@with_settings
 def simulate(
     city: Annotated[Literal["shinjuku"], typer.Argument(help="The city that ships with us.")],
     folder: Annotated[str, typer.Option("--out", help="Folder of map, logs and routes.")],
-    preset: Annotated[
-        str, typer.Option(help="physical, paper, or your own YAML file.")
-    ] = "physical",
+    what: Annotated[SimulateSettings, fields("preset", "scans_per_point", "seed", "size")],
+    day: Annotated[SimulationSettings, fields("drive")],
     paths: Annotated[str | None, typer.Option(help="Only these, e.g. I,III; default: all.")] = None,
-    scans_per_point: Annotated[int, typer.Option(help="Turns of the lidar per metre.")] = 1,
-    seed: Annotated[int, typer.Option(help="Seed of everything.")] = 0,
-    drive: Annotated[int, typer.Option(min=0, help="Another day: other traffic and noise.")] = 0,
-    size: Annotated[Literal["full", "small"], typer.Option(help="small: 40 m per path.")] = "full",
     dry_run: DryRun = False,
     cluster: Cluster = HERE,
 ) -> None:
     """Simulate a survey of Shinjuku and drives through it; a killed run continues."""
-    settings = load_preset(preset).model_copy(update={"seed": seed, "drive": drive})
-    what: dict[str, Any] = {
-        "paths": paths.split(",") if paths else None,
-        "scans_per_point": scans_per_point,
-        "size": size,
-    }
+    changes = {"seed": what.seed, "drive": day.drive}
+    settings = load_preset(what.preset).model_copy(update=changes)
+    wanted = extent(what) | {"paths": paths.split(",") if paths else None}
     if dry_run:
-        out.print(plan_table(simulation.plan_simulation(settings, folder, **what)))
+        out.print(plan_table(simulation.plan_simulation(settings, folder, **wanted)))
         return
     with cluster.client(SCENE_BYTES) as client, progress() as watch:
-        made = simulation.simulate(settings, folder, **what, client=client, watch=watch)
+        made = simulation.simulate(settings, folder, **wanted, client=client, watch=watch)
     say(f"{city}, preset {settings.preset}: {settings.note}")
     say(f"The map is in {made}/survey, the drives are in {made}/logs")
 

@@ -7,59 +7,39 @@ import typer
 
 from tilestream.apps import diff as map_diff
 from tilestream.cli.cluster import HERE, Cluster, on_cluster
-from tilestream.cli.options import (
-    AsJson,
-    DryRun,
-    Every,
-    FromS,
-    Memory,
-    Offset,
-    PointsTopic,
-    PoseTopic,
-    StoreUrl,
-    UntilS,
-    parse_bytes,
-)
+from tilestream.cli.fields import fields, with_settings
+from tilestream.cli.options import AsJson, DryRun, StoreUrl
 from tilestream.cli.printing import out, print_json, say
 from tilestream.cli.progress import progress
 from tilestream.cli.tables import TILE_CHANGES, diff_table, info_table, plan_table, tile_table
 from tilestream.errors import PartialError
 from tilestream.formats import describe
-from tilestream.formats.logs import ScanSelection
 from tilestream.pipeline.jobs import ingest as ingest_map
-from tilestream.settings import IngestSettings
+from tilestream.pipeline.jobs.run_inputs import ingest_settings, scans_of
+from tilestream.settings import MapSettings, PlaceSettings
 from tilestream.store import POINTS, TileStore, open_store
+
+LOG_FIELDS = ("points_topic", "pose_topic", "every", "offset", "from_s", "until_s")
+"""Which scans of a log are used, and where they are in it."""
 
 
 @on_cluster
+@with_settings
 def ingest(
     sources: Annotated[
         list[str], typer.Argument(help="Files, globs, Autoware map directories, mixed.")
     ],
     store: Annotated[str, typer.Option(help="The tile store: a path or an fsspec URL.")],
-    tile_size: Annotated[float, typer.Option(help="Edge of a tile [m].")] = 100.0,
-    halo: Annotated[float, typer.Option(help="What tasks read around a tile [m].")] = 10.0,
-    map_leaf: Annotated[
-        float, typer.Option(help="Thin to one point per voxel [m]; 0: keep.")
-    ] = 0.2,
-    crs: Annotated[str | None, typer.Option(help="CRS of the map, e.g. EPSG:6677.")] = None,
-    points_topic: PointsTopic = None,
-    pose_topic: PoseTopic = None,
-    every: Every = 1,
-    offset: Offset = 0,
-    from_s: FromS = 0.0,
-    until_s: UntilS = None,
-    memory: Memory = "1.5GB",
+    how: Annotated[MapSettings, fields("tile_size", "halo", "map_leaf", "crs", *LOG_FIELDS)],
+    limits: Annotated[PlaceSettings, fields("memory")],
     dry_run: DryRun = False,
     cluster: Cluster = HERE,
 ) -> None:
     """Make a tile store from point clouds, map directories and logs of drives."""
-    settings = IngestSettings(tile_size=tile_size, halo=halo, map_leaf=map_leaf, crs=crs)
-    allowed = parse_bytes(memory)
-    scans = ScanSelection(every=every, offset=offset, from_s=from_s, until_s=until_s)
+    settings, scans, allowed = ingest_settings(how), scans_of(how), limits.memory
     if dry_run:
         plan = ingest_map.plan_ingest(
-            sources, store, settings, allowed, points_topic, pose_topic, scans
+            sources, store, settings, allowed, how.points_topic, how.pose_topic, scans
         )
         out.print(plan_table(plan))
         return
@@ -73,8 +53,8 @@ def ingest(
                 client=client,
                 memory=allowed,
                 watch=watch,
-                points_topic=points_topic,
-                pose_topic=pose_topic,
+                points_topic=how.points_topic,
+                pose_topic=how.pose_topic,
                 scans=scans,
             )
         except PartialError as error:

@@ -160,12 +160,13 @@ READ_AS = {
 """Scale, unit and meaning of the facts of a drive, for people."""
 
 
-def error_table(labels: pd.DataFrame) -> Table:
+def error_table(labels: pd.DataFrame, matcher: str) -> Table:
     """The errors of a drive, figure and meaning, and its worst places."""
     table = Table(title="localization error", title_justify="left", box=SIMPLE, show_header=False)
     table.add_column(justify="right", no_wrap=True)
     table.add_column()
     facts = error_facts(labels)
+    table.add_row(matcher, "the matcher")
     table.add_row(f"{facts['sample_points']:,}", "sample points")
     table.add_row(f"{facts['failed']:,}", "of them without a measurement")
     for name, (scale, unit, meaning) in READ_AS.items():
@@ -216,7 +217,9 @@ def diff_table(found: MapDiff) -> Table:
 def comparison_table(content: dict[str, Any]) -> Table:
     """The choices of a comparison, a line each."""
     over = f"over {content['threshold']:g} m"
-    table = Table(title="comparison", title_justify="left", box=SIMPLE)
+    table = Table(
+        title=f"comparison, matcher {content['facts']['matcher']}", title_justify="left", box=SIMPLE
+    )
     table.add_column("choice", no_wrap=True)
     for column in (
         "median [m]",

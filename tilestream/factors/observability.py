@@ -24,7 +24,6 @@ from tilestream.factors.virtual_scan import (
     Beams,
     Scene,
     VirtualScan,
-    VirtualSettings,
     first_returns,
     near_share,
     virtual_scan,
@@ -34,8 +33,8 @@ from tilestream.grid import MM_PER_M, Box
 from tilestream.kernels.cells import cell_of_points, cell_sums
 from tilestream.records import Cells, Column, Float64, Int64
 from tilestream.registration import register
-from tilestream.sensor import VLP16, Sensor
-from tilestream.settings import RegistrationSettings
+from tilestream.sensor import VLP16, Carrier, fov_deg_of
+from tilestream.settings import RegistrationSettings, VirtualSettings
 from tilestream.store import TileStore
 
 BLOCK = 25.0
@@ -91,7 +90,7 @@ def observability(
     store: TileStore,
     positions: ArrayLike,
     headings: ArrayLike,
-    sensor: Sensor = VLP16,
+    sensor: Carrier = VLP16,
     seeing: VirtualSettings | None = None,
     registration: RegistrationSettings | None = None,
     cell_size: float = 2.0,
@@ -106,7 +105,7 @@ def observability(
         positions: (k, 3) places of the lidar [m, map frame], already at its height. NaN as z: a
             place without ground, see `sample_points`.
         headings: (k,) directions of travel [rad, from the map's x axis].
-        sensor: beams, range and noise.
+        sensor: beams, range and noise; or a vehicle of several.
         seeing: usable range, blind sector, drop-outs, starts; default `VirtualSettings()`.
         registration: the matcher of the vehicle; default `RegistrationSettings()`.
         cell_size: edge of a cell [m]; the tile size is a multiple of it.
@@ -145,13 +144,13 @@ class _View:
     def __init__(
         self,
         store: TileStore,
-        sensor: Sensor,
+        sensor: Carrier,
         seeing: VirtualSettings,
         registration: RegistrationSettings,
         cell_size: float,
     ) -> None:
         self.store = store
-        self.sensor = sensor
+        self.fov_deg = fov_deg_of(sensor)
         self.seeing = seeing
         self.registration = registration
         self.cell_size = cell_size
@@ -182,23 +181,25 @@ class _View:
         """The surfels that can be seen from the places, those of them that are ghosts apart, and
         the cells around.
         """
-        reach, edge_mm = self.beams.range_max, surfel_mm(self.store)
+        reach, edge_mm = self.beams.range_max + self.beams.rim, surfel_mm(self.store)
         rim = 1.0 + REACH_EDGES * edge_mm / MM_PER_M
         surfels = surfels_in(self.store, Box.around(places, reach + rim))
         cells = self.store.cells_in(Box.around(places, reach + MARGIN), self.cell_size)
         ghost = np.zeros(len(surfels), np.bool_)
         if self.seeing.without_ghosts:
             ghost = ghosts_among(surfels, edge_mm)
-        real, ghosts = (
-            in_view(surfels.where(chosen), places, self.sensor.fov_deg, reach)
-            for chosen in (~ghost, ghost)
-        )
+        real, ghosts = (self.in_view(surfels.where(chosen), places) for chosen in (~ghost, ghost))
         return real, ghosts, cells
 
     def scene(self, surfels: Surfels, places: Float64) -> Scene | None:
         """The scene that places near one another share; None: nothing is in view."""
-        near = in_view(surfels, places, self.sensor.fov_deg, self.beams.range_max)
-        return Scene.of(near, whole_places(places), surfel_mm(self.store)) if len(near) else None
+        near = self.in_view(surfels, places)
+        stands = whole_places(np.concatenate([places - self.beams.rim, places + self.beams.rim]))
+        return Scene.of(near, stands, surfel_mm(self.store)) if len(near) else None
+
+    def in_view(self, surfels: Surfels, places: Float64) -> Surfels:
+        """The surfels that a beam from any of the places can meet, and a few more."""
+        return in_view(surfels, places, self.fov_deg, self.beams.range_max, self.beams.rim)
 
     def seen_from(
         self,
@@ -209,7 +210,7 @@ class _View:
         heading: float,
     ) -> Row:
         """The row of a place; columns that are not known there are left out."""
-        n = len(self.beams.direction)
+        n = len(self.beams)
         if scene is None:
             return {"status": "missing", "reason": NOTHING.format(0, n)}
         place_mm = whole_places(place)
@@ -217,7 +218,7 @@ class _View:
         if walled > INSIDE:
             reason = WALLED.format(walled, self.seeing.range_min)
             return {"status": "failed", "reason": reason}
-        scan = virtual_scan(scene, place_mm, heading, self.sensor, self.seeing, self.beams)
+        scan = virtual_scan(scene, place_mm, heading, self.seeing, self.beams)
         view: Row = {
             "ob_returns": scan.return_share,
             "ob_unmapped": scan.unmapped_share,
@@ -346,7 +347,11 @@ def _schur(L: Float64, kept: list[int]) -> Float64:
 
 
 def in_view(
-    surfels: Surfels, places: Float64, fov_deg: tuple[float, float], reach: float
+    surfels: Surfels,
+    places: Float64,
+    fov_deg: tuple[float, float],
+    reach: float,
+    rim: float = 0.0,
 ) -> Surfels:
     """The surfels that a beam from any of the places can meet, and a few more.
 
@@ -355,14 +360,16 @@ def in_view(
         places: (k, 3) places [m, map frame], best near one another.
         fov_deg: lowest and highest elevation of the beams [deg].
         reach: range of the beams [m].
+        rim: how far from its place a beam may start [m].
     """
     middle = places.mean(axis=0)
     around = float(np.hypot(*(places - middle)[:, :2].T).max())
     offset = surfels.centre_mm / MM_PER_M - middle
     away = np.hypot(offset[:, 0], offset[:, 1])
-    near, far = np.maximum(away - around - 1.0, 0.0), away + around + 1.0
+    near, far = np.maximum(away - around - 1.0 - rim, 0.0), away + around + 1.0 + rim
     low, high = (math.tan(math.radians(min(max(edge, -89.0), 89.0))) for edge in fov_deg)
-    bottom, top = (places - middle)[:, 2].min() - 1.0, (places - middle)[:, 2].max() + 1.0
+    up = (places - middle)[:, 2]
+    bottom, top = up.min() - 1.0 - rim, up.max() + 1.0 + rim
     floor = bottom + low * (far if low < 0.0 else near)
     ceiling = top + high * (far if high > 0.0 else near)
     return surfels.where((near <= reach) & (offset[:, 2] >= floor) & (offset[:, 2] <= ceiling))

@@ -1,12 +1,13 @@
 """Columns that every table of sample points has: the place first, status and reason last."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from tilestream.errors import UsageError
 from tilestream.factors.sample_points import raised
@@ -65,6 +66,11 @@ class Samples:
     def places(self) -> Float64:
         """(k, 2) x and y [m, map frame]."""
         return np.column_stack([self.rows["x"], self.rows["y"]])
+
+    def near(self, places: Float64, reach: float) -> "Samples":
+        """Those within `reach` [m] of any of (n, 2) places, horizontally."""
+        distance, _ = cKDTree(places).query(self.places)
+        return replace(self, rows=self.rows[distance <= reach])
 
     def facts(self) -> list[Any]:
         """The content as JSON values: part of the identity of tables that are made from it."""

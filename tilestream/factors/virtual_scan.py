@@ -3,11 +3,9 @@
 """
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from tilestream.factors.surfels import Surfels
 from tilestream.grid import MM_PER_M
@@ -25,37 +23,11 @@ from tilestream.kernels.virtual_scan import (
     mark_bricks,
 )
 from tilestream.records import Float64, Int64
-from tilestream.sensor import Sensor
-from tilestream.settings import Settings
+from tilestream.sensor import Carrier, rim_of
+from tilestream.settings import VirtualSettings
 
 COLUMN_MM = 10_000
 """Edge of the columns that tell where the map has anything [mm]."""
-
-Share = Annotated[float, Field(ge=0.0, le=1.0)]
-
-
-class VirtualSettings(Settings):
-    """How a vehicle sees with its sensor, and how it is started in the virtual drive."""
-
-    range_max: Annotated[float, Field(gt=0.0)] | None = None
-    """Usable range [m], no more than the sensor's; None: the sensor's."""
-    range_min: Annotated[float, Field(ge=0.0)] = 0.9
-    """Surfels nearer than this are ignored: the vehicle itself is there [m]."""
-    blind_rear_deg: Annotated[float, Field(ge=0.0, lt=360.0)] = 0.0
-    """Sector to the rear that the vehicle hides [deg]."""
-    fading_from: Share = 0.6
-    """Share of the usable range beyond which returns are lost …"""
-    fading: Share = 0.6
-    """… up to this share of them at its end, linearly."""
-    grazing_deg: Annotated[float, Field(gt=0.0, lt=90.0)] = 75.0
-    """Angle of incidence beyond which returns are lost, more as its cosine falls to 0 [deg]."""
-    without_ghosts: bool = True
-    """Whether traffic that the survey recorded is left out of the scan (ghosts); some thin objects
-    such as posts are left out with it."""
-    starts: Annotated[int, Field(ge=8)] | None = 64
-    """Starts of the virtual drive, spread over the disc of starts; None: all of them."""
-    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
-    """Seed of noise and drop-outs; the place is part of it too."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,35 +72,76 @@ class Scene:
 
 
 @dataclass(frozen=True, eq=False)
-class Beams:
-    """All beams of one turn of a sensor outside the vehicle's blind sector."""
+class SensorBeams:
+    """The beams of one turn of a sensor of a vehicle, outside the vehicle's blind sector."""
 
     direction: Float64
-    """(n, 3) unit vectors in the lidar frame: x ahead, y left, z up; firing by firing, counter-
-    clockwise from ahead, each from the lowest beam to the highest."""
+    """(n, 3) unit vectors in the frame of the vehicle: x ahead, y left, z up; firing by firing,
+    counter-clockwise from ahead of the sensor, each from the lowest beam to the highest."""
+    origin: Float64
+    """(3,) where the sensor is in that frame [m]."""
     range_max: float
     """Usable range [m]."""
+    range_noise: float
+    """Standard deviation of a range [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Beams:
+    """All beams of one turn of a vehicle's sensors."""
+
+    sensors: tuple[SensorBeams, ...]
+    """Those of each sensor."""
+    range_max: float
+    """Largest usable range [m]."""
+    rim: float
+    """How far from the vehicle's origin a sensor is at most [m]."""
 
     @classmethod
-    def of(cls, sensor: Sensor, seeing: VirtualSettings) -> "Beams":
-        """The beams of a sensor, without its blind sector."""
-        firings = round(360.0 / sensor.azimuth_step_deg)
-        azimuth = np.arange(firings) * (2.0 * np.pi / firings)
-        if seeing.blind_rear_deg > 0.0:
-            blind = np.deg2rad(seeing.blind_rear_deg) / 2.0
-            azimuth = azimuth[np.abs(azimuth - np.pi) > blind - 1e-9]
-        elevation = np.deg2rad(np.array(sensor.elevations_deg))
-        across, up = np.cos(elevation), np.sin(elevation)
-        direction = np.empty((len(azimuth), len(elevation), 3))
-        direction[..., 0] = np.cos(azimuth)[:, None] * across
-        direction[..., 1] = np.sin(azimuth)[:, None] * across
-        direction[..., 2] = up
-        reach = sensor.range_max if seeing.range_max is None else seeing.range_max
-        return cls(direction.reshape(-1, 3), min(reach, sensor.range_max))
+    def of(cls, vehicle: Carrier, seeing: VirtualSettings) -> "Beams":
+        """The beams of a vehicle, without its blind sector."""
+        sensors = []
+        for sensor in vehicle.sensors:
+            rays = sensor.rays().reshape(-1, 3)
+            reach = sensor.range_max if seeing.range_max is None else seeing.range_max
+            sensors.append(
+                SensorBeams(
+                    sensor.in_base(rays[sensor.fires(rays, seeing.blind_rear_deg)]),
+                    sensor.mount.T_base_lidar[:3, 3],
+                    min(reach, sensor.range_max),
+                    sensor.range_noise,
+                )
+            )
+        reach = max(sensor.range_max for sensor in sensors)
+        return cls(tuple(sensors), reach, rim_of(vehicle))
+
+    @property
+    def direction(self) -> Float64:
+        """(n, 3) unit vectors in the frame of the vehicle, sensor by sensor."""
+        return np.concatenate([sensor.direction for sensor in self.sensors])
+
+    def __len__(self) -> int:
+        return sum(len(sensor.direction) for sensor in self.sensors)
+
+
+@dataclass(frozen=True, eq=False)
+class Returns:
+    """The first surfels that the beams of a sensor at a place meet."""
+
+    place_mm: Int64
+    """(3,) of the sensor [mm, map frame]."""
+    origin: Float64
+    """(3,) the same in the frame of the vehicle [m]."""
+    direction: Float64
+    """(n, 3) of the beams in the map frame."""
+    ranges: Float64
+    """(n,) of the first surfel [m]; inf: none is met."""
+    cosine: Float64
+    """(n,) of incidence; 0: none is met."""
 
 
 def near_share(scene: Scene, place_mm: Int64, beams: Beams, within: float) -> float:
-    """Share of the beams of a lidar at a place that meet the map within a short distance.
+    """Share of the beams of a vehicle at a place that meet the map within a short distance.
 
     Args:
         scene: the map around the place.
@@ -136,10 +149,11 @@ def near_share(scene: Scene, place_mm: Int64, beams: Beams, within: float) -> fl
         beams: its beams, as if it headed along the map's x axis.
         within: the distance [m].
     """
-    n = len(beams.direction)
-    ranges, cosine = np.empty(n), np.empty(n)
-    cast(scene.bricks, place_mm, beams.direction, 0.0, within * MM_PER_M, ranges, cosine)
-    return float(np.isfinite(ranges).mean())
+    met = [
+        np.isfinite(_cast(scene, place_mm, 0.0, sensor, 0.0, within).ranges)
+        for sensor in beams.sensors
+    ]
+    return float(np.concatenate(met).mean())
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +167,7 @@ class VirtualScan:
     came: NDArray[np.bool_]
     """(n,) which returns come back to the sensor."""
     points: Float64
-    """(m, 3) those returns with the noise of the sensor, in the lidar frame [m]."""
+    """(m, 3) those returns with the noise of the sensor, in the frame of the vehicle [m]."""
     return_share: float
     """Share of the beams that come back, 1 for all."""
     unmapped_share: float
@@ -161,14 +175,9 @@ class VirtualScan:
 
 
 def virtual_scan(
-    scene: Scene,
-    place_mm: Int64,
-    heading: float,
-    sensor: Sensor,
-    seeing: VirtualSettings,
-    beams: Beams,
+    scene: Scene, place_mm: Int64, heading: float, seeing: VirtualSettings, beams: Beams
 ) -> VirtualScan:
-    """The scan of an upright lidar at a place: first returns, drop-outs, noise.
+    """The scan of a vehicle at a place: first returns, drop-outs, noise.
 
     A return at range r with cosine of incidence c comes back with the probability
     (1 - fading f) min(1, c / cos(grazing)), f rising linearly from 0 to 1 between `fading_from` and
@@ -177,41 +186,87 @@ def virtual_scan(
 
     Args:
         scene: the map around the place, as far as the beams reach.
-        place_mm: (3,) of the lidar [mm, map frame].
+        place_mm: (3,) of the vehicle's origin [mm, map frame].
         heading: direction of travel [rad, from the map's x axis].
-        sensor: its noise.
         seeing: its drop-outs.
-        beams: its beams, `Beams.of(sensor, seeing)`.
+        beams: its beams, `Beams.of(vehicle, seeing)`.
     """
-    ranges, cosine, direction = first_returns(scene, place_mm, heading, seeing, beams)
-    reach = beams.range_max * MM_PER_M
-    left = leave_map(
-        scene.mapped, scene.mapped_corner, COLUMN_MM, place_mm, direction, ranges, reach
-    )
-    luck, radius, turn = draws(place_mm, seeing.seed, len(ranges), 3)
-    came = luck < probability(ranges, cosine, beams.range_max, seeing)
-    noise = np.sqrt(-2.0 * np.log(radius[came])) * np.cos(2.0 * np.pi * turn[came])
-    measured = ranges[came] + sensor.range_noise * noise
-    points = beams.direction[came] * measured[:, None]
+    draw = draws(place_mm, seeing.seed, len(beams), 3)
+    parts, first = [], 0
+    for sensor in beams.sensors:
+        behind = first + len(sensor.direction)
+        found = _cast(scene, place_mm, heading, sensor, seeing.range_min, sensor.range_max)
+        parts.append(_measured(scene, found, sensor, seeing, draw[:, first:behind]))
+        first = behind
+    ranges, cosine, came, left, points = (np.concatenate(part) for part in zip(*parts, strict=True))
     return VirtualScan(ranges, cosine, came, points, float(came.mean()), float(left.mean()))
+
+
+def _measured(
+    scene: Scene, found: Returns, sensor: SensorBeams, seeing: VirtualSettings, draw: Float64
+) -> tuple[Float64, Float64, NDArray[np.bool_], NDArray[np.bool_], Float64]:
+    """What comes back to a sensor: ranges, cosines, which return, which leave the map, points in
+    the frame of the vehicle; from the (3, n) random numbers of its beams.
+    """
+    reach = sensor.range_max * MM_PER_M
+    left = leave_map(
+        scene.mapped,
+        scene.mapped_corner,
+        COLUMN_MM,
+        found.place_mm,
+        found.direction,
+        found.ranges,
+        reach,
+    )
+    luck, radius, turn = draw
+    came = luck < probability(found.ranges, found.cosine, sensor.range_max, seeing)
+    noise = np.sqrt(-2.0 * np.log(radius[came])) * np.cos(2.0 * np.pi * turn[came])
+    measured = found.ranges[came] + sensor.range_noise * noise
+    points = sensor.direction[came] * measured[:, None] + found.origin
+    return found.ranges, found.cosine, came, left, points
 
 
 def first_returns(
     scene: Scene, place_mm: Int64, heading: float, seeing: VirtualSettings, beams: Beams
 ) -> tuple[Float64, Float64, Float64]:
-    """The first surfels that the beams of a lidar at a place meet; arguments as of `virtual_scan`.
+    """The first surfels that the beams of a vehicle at a place meet; arguments as of
+    `virtual_scan`.
 
     Returns:
         (n,) ranges [m], inf where nothing is met; (n,) cosines of incidence, 0 there; (n, 3)
         directions in the map frame.
     """
-    c, s = np.cos(heading), np.sin(heading)
-    R_map_lidar = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    direction = turned(R_map_lidar, beams.direction)
-    ranges, cosine = np.empty(len(direction)), np.empty(len(direction))
-    near, reach = seeing.range_min * MM_PER_M, beams.range_max * MM_PER_M
-    cast(scene.bricks, place_mm, direction, near, reach, ranges, cosine)
+    found = [
+        _cast(scene, place_mm, heading, sensor, seeing.range_min, sensor.range_max)
+        for sensor in beams.sensors
+    ]
+    ranges, cosine, direction = (
+        np.concatenate([getattr(part, name) for part in found])
+        for name in ("ranges", "cosine", "direction")
+    )
     return ranges, cosine, direction
+
+
+def _cast(
+    scene: Scene,
+    place_mm: Int64,
+    heading: float,
+    sensor: SensorBeams,
+    range_min: float,
+    range_max: float,
+) -> Returns:
+    """What the beams of a sensor meet between two ranges [m] from where it is, whole millimetres
+    of the map, on a vehicle whose origin is at a place.
+    """
+    c, s = np.cos(heading), np.sin(heading)
+    R_map_base = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    direction = turned(R_map_base, sensor.direction)
+    offset_mm = np.rint(turned(R_map_base, sensor.origin[None])[0] * MM_PER_M).astype(np.int64)
+    ranges, cosine = np.empty(len(direction)), np.empty(len(direction))
+    at_mm, near, far = place_mm + offset_mm, range_min * MM_PER_M, range_max * MM_PER_M
+    cast(scene.bricks, at_mm, direction, near, far, ranges, cosine)
+    origin = turned(R_map_base.T, offset_mm[None] / MM_PER_M)[0]
+    return Returns(at_mm, origin, direction, ranges, cosine)
 
 
 def probability(

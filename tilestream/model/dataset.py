@@ -222,6 +222,7 @@ def join(
     labels: Mapping[str, pd.DataFrame],
     columns: Sequence[Column],
     *,
+    own_factors: Mapping[str, pd.DataFrame] | None = None,
     tolerance: float = TOLERANCE,
     block: float = BLOCK,
     made_with: Mapping[str, Any] | None = None,
@@ -239,6 +240,8 @@ def join(
         labels: the label tables (`x`, `y`, `z`, `sample`, `TARGETS`, `status`, …) by the name of
             their group: one log as seen by one sensor.
         columns: the catalogue of the factors; those absent from the table are no features.
+        own_factors: the factor tables, of the same places, of groups that were seen with another
+            lidar.
         tolerance: farthest sample point that a label takes its factors from [m].
         block: least length of a block along a path [m]; a shorter path is one block.
         made_with: what the factors were computed with (`made_with`).
@@ -254,7 +257,10 @@ def join(
     features = tuple(c for c in features_of(columns) if c.name in places)
     if not features:
         raise UsageError("the factor table has none of the catalogue's factors")
-    joined = [_joined(places, name, labels[name], tolerance) for name in sorted(labels)]
+    seen = {name: _places(table, block) for name, table in (own_factors or {}).items()}
+    joined = [
+        _joined(seen.get(name, places), name, labels[name], tolerance) for name in sorted(labels)
+    ]
     table = pd.concat(joined or [_joined(places, "", _NO_LABELS, tolerance)], ignore_index=True)
     table = _without_lone(_judged(table, [column.name for column in features]))
     kept = table[table["reason"] == ""]

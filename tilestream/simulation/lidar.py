@@ -30,10 +30,10 @@ class Target(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Turn:
-    """The rays of one turn of a sensor, in its own frame, in order of their firing."""
+    """The rays of one turn of a sensor, in the order of their firing."""
 
     direction: Float64
-    """(n, 3) unit vectors in the lidar frame: x ahead, y left, z up."""
+    """(n, 3) unit vectors in the frame of the vehicle: x ahead, y left, z up."""
     ring: NDArray[np.int32]
     """(n,) beam, 0 the lowest."""
     time: Float64
@@ -52,24 +52,16 @@ def turn_of(sensor: Sensor, first_azimuth: float = np.pi, blind_deg: float = 0.0
         first_azimuth: where the turn begins [rad, from x to y]; the cut is at the rear by default.
         blind_deg: sector around the rear that gives nothing [deg].
     """
-    firings = round(360.0 / sensor.azimuth_step_deg)
-    azimuth = first_azimuth - np.arange(firings) * (2 * np.pi / firings)
-    elevation = np.deg2rad(sensor.elevations_deg)
-    beams = len(elevation)
-    across, up = np.cos(elevation), np.sin(elevation)
-    direction = np.empty((firings, beams, 3))
-    direction[..., 0] = np.cos(azimuth)[:, None] * across
-    direction[..., 1] = np.sin(azimuth)[:, None] * across
-    direction[..., 2] = up
+    direction = sensor.rays(first_azimuth, clockwise=True)
+    firings, beams, _ = direction.shape
     time = ((np.arange(firings) + 0.5) / firings - 0.5) / sensor.rate_hz
-    behind = np.abs(np.mod(azimuth, 2 * np.pi) - np.pi)
-    seen = behind >= np.deg2rad(blind_deg) / 2 if blind_deg > 0 else np.ones(firings, bool)
-    number = np.arange(firings * beams).reshape(firings, beams)
+    seen = sensor.fires(direction, blind_deg)
+    firing, ring = np.nonzero(seen)
     return Turn(
-        direction[seen].reshape(-1, 3),
-        np.tile(np.arange(beams, dtype=np.int32), int(seen.sum())),
-        np.repeat(time[seen], beams),
-        number[seen].ravel(),
+        sensor.in_base(direction[seen]),
+        ring.astype(np.int32),
+        time[firing],
+        np.flatnonzero(seen),
         firings * beams,
     )
 
@@ -90,7 +82,8 @@ def measure(
 
     Args:
         targets: scenes of what stands and what moves; the nearest hit counts.
-        T_map_lidar: (4, 4) pose in the middle of the turn.
+        T_map_lidar: (4, 4) pose of the vehicle's frame in the middle of the turn; without a mount
+            it is that of the lidar.
         velocity: (3,) of the lidar in the map [m/s].
         yaw_rate: turning of the vehicle [rad/s].
         settings: of the lidar.
@@ -101,7 +94,8 @@ def measure(
     rng = stream(seed[0], "scan noise", *seed[1:])
     turn = turn_of(sensor, rng.uniform(-np.pi, np.pi), settings.blind_deg)
     time = turn.time if settings.distortion else np.zeros(len(turn.time))
-    start = T_map_lidar[:3, 3] + time[:, None] * velocity
+    origin = sensor.mount.T_base_lidar[:3, 3]
+    start = T_map_lidar[:3, :3] @ origin + T_map_lidar[:3, 3] + time[:, None] * velocity
     angle = time * yaw_rate
     local = turn.direction
     turned = np.column_stack(
@@ -125,7 +119,7 @@ def measure(
     light = REFLECTIVITY[material[came]] * (0.3 + 0.7 * cosine[came])
     return Scan(
         stamp_ns,
-        local[came] * measured[:, None],
+        local[came] * measured[:, None] + origin,
         T_map_lidar,
         light.astype(np.float32),
         turn.ring[came],

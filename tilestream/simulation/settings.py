@@ -3,19 +3,30 @@
 import zlib
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import yaml
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
+from tilestream.config import Settings
 from tilestream.errors import SourceNotFoundError, UsageError
-from tilestream.sensor import HDL64, OS1_128, VLP16, Sensor
-from tilestream.settings import Settings
+from tilestream.sensor import SENSORS, Sensor, Vehicle, named
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Length = Annotated[float, Field(ge=0.0)]
-SENSORS = {sensor.name: sensor for sensor in (VLP16, HDL64, OS1_128)}
+
+
+def _alone(given: Any) -> Any:
+    """A sensor as `named` reads it.
+
+    Raises:
+        UsageError: it is a list of sensors.
+    """
+    found = named(given)
+    if isinstance(found, Vehicle):
+        raise UsageError("the simulated vehicle has one lidar: give one sensor")
+    return found
 
 
 class CitySettings(Settings):
@@ -40,8 +51,8 @@ class CitySettings(Settings):
 class LidarSettings(Settings):
     """How the lidar of the drives measures."""
 
-    sensor: Sensor | Literal["VLP16", "HDL64", "OS1_128"] = "VLP16"
-    """The sensor, by name or as its own data."""
+    sensor: Annotated[str | Sensor, BeforeValidator(_alone)] = "VLP16"
+    """The sensor: a name that ships, a YAML file, or its fields."""
     height: Annotated[float, Field(gt=0.0)] = 2.0
     """Height above the ground [m]."""
     range_max: Length | None = None

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from tilestream.errors import UsageError
 from tilestream.records import Float64, Scan
+from tilestream.sensor import in_blind_sector, kept_beams
 
 COLUMN_DEG = 0.25
 """Width of the azimuth columns in which gaps between beams are measured: about a firing [deg]."""
@@ -50,8 +51,7 @@ def degraded(
     if range_max is not None:
         keep &= (scan.points**2).sum(axis=1) <= range_max**2
     if blind_rear_deg:
-        from_rear = np.arctan2(scan.points[:, 1], -scan.points[:, 0])
-        keep &= np.abs(from_rear) > np.radians(blind_rear_deg) / 2
+        keep &= ~in_blind_sector(scan.points, blind_rear_deg, slack=0.0)
     return select(scan, keep)
 
 
@@ -75,8 +75,7 @@ def _on_beams(scan: Scan, beams: int, recorded: int | None) -> NDArray[np.bool_]
         recorded = recorded or int(scan.ring.max()) + 1
         _check_enough(beams, recorded)
         order = _rings_by_elevation(scan.points, scan.ring, recorded)
-        chosen = order[((np.arange(beams) + 0.5) * recorded / beams).astype(np.int64)]
-        return np.isin(scan.ring, chosen)
+        return np.isin(scan.ring, order[kept_beams(recorded, beams)])
     elevation = _elevation_deg(scan.points)
     low, high = np.percentile(elevation, [0.5, 99.5])
     if recorded:

@@ -9,16 +9,16 @@ import pandas as pd
 from tilestream.errors import PartialError
 from tilestream.factors.catalogue import Which
 from tilestream.factors.rows import Samples, in_route_order, samples_by_tile
-from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.grid import TileKey, whole_mm
 from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, paths_of
+from tilestream.pipeline.engine.stage import Stage
 from tilestream.pipeline.stages.factors import Looking, factors, factors_task
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.observe import Observing, observe, observe_task
 from tilestream.records import Route
-from tilestream.sensor import VLP16, Sensor
-from tilestream.settings import RegistrationSettings
+from tilestream.sensor import VLP16, Carrier, Sensor
+from tilestream.settings import LabelSettings, RegistrationSettings, VirtualSettings
 from tilestream.store import TileStore
 from tilestream.tables import read_tables, remove_others
 
@@ -101,7 +101,7 @@ def observe_along(
     out: str | os.PathLike[str],
     *,
     spacing: float = 1.0,
-    sensor: Sensor = VLP16,
+    sensor: Carrier = VLP16,
     seeing: VirtualSettings | None = None,
     registration: RegistrationSettings | None = None,
     sensor_height: float = SENSOR_HEIGHT,
@@ -120,7 +120,7 @@ def observe_along(
         spacing: distance between sample points [m].
         sensor: what looks.
         seeing: usable range, blind sector, drop-outs, starts; default `VirtualSettings()`.
-        registration: the matcher of the vehicle; default `RegistrationSettings()`.
+        registration: the matcher of the vehicle; default `autoware`, as of all jobs.
         sensor_height: height of the lidar above the route, or above the ground where the route
             has no z [m].
         cell_size: edge of an NDT cell [m].
@@ -141,7 +141,7 @@ def observe_along(
     observing = Observing(
         sensor,
         seeing or VirtualSettings(),
-        registration or RegistrationSettings(),
+        registration or LabelSettings().registration,
         cell_size,
         sensor_height,
     )
@@ -157,6 +157,7 @@ def plan_observe(
     observing: Observing,
     memory: int,
     group: str = "",
+    applies: Stage = observe,
 ) -> Plan:
     """What `observe_along` will run; other arguments and errors as there.
 
@@ -167,11 +168,13 @@ def plan_observe(
         observing: what is observed with.
         memory: what a task may use [bytes].
         group: as whose sensor, where one plan observes with several.
+        applies: `observe`, or `observe_drive`.
     """
     map_plan.store.grid.require_cell_size(whole_mm(observing.cell_size, "cell_size"))
     folder = os.fspath(out)
     tasks = [
-        observe_task(map_plan, key, some, observing, folder, group) for key, some in samples.items()
+        observe_task(map_plan, key, some, observing, folder, group, applies)
+        for key, some in samples.items()
     ]
     return Plan.of((*map_plan.tasks.values(), *tasks), memory)
 

@@ -22,10 +22,10 @@ from tilestream.pipeline.jobs.run_inputs import (
     simulations,
 )
 from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
-from tilestream.pipeline.jobs.run_settings import RunSettings, SimulateSettings
 from tilestream.pipeline.jobs.simulate import plan_simulation
 from tilestream.pipeline.stages.map_plan import MapPlan, TilePoints
 from tilestream.pipeline.stages.scatter import SourceSpan
+from tilestream.settings import RunSettings, SimulateSettings
 from tilestream.store import StoreSettings, TileStore, open_store
 
 
@@ -88,13 +88,15 @@ def _expected_map(
     plan = plan_ingest(
         inputs.sources,
         settings.store_url,
-        ingest_settings(settings),
+        ingest_settings(settings.map),
         settings.memory,
         settings.map.points_topic,
         settings.map.pose_topic,
         map_scans(settings, inputs),
     )
-    store = TileStore(settings.store_url, StoreSettings(**ingest_settings(settings).model_dump()))
+    store = TileStore(
+        settings.store_url, StoreSettings(**ingest_settings(settings.map).model_dump())
+    )
     have: dict[TileKey, TilePoints] = {}
     unknown: list[str] = []
     spans = [task.reads["blocks"] for task in plan.tasks]

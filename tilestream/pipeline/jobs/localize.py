@@ -18,12 +18,12 @@ from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.outputs import Parquet
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, paths_of
 from tilestream.pipeline.engine.stage import Task
-from tilestream.pipeline.stages.drive_scans import DriveScans, Reading, Sample
+from tilestream.pipeline.stages.drive_scans import DriveScans, Reading, Sample, opened
 from tilestream.pipeline.stages.label import label
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.register import MARGIN, Measuring, register
 from tilestream.records import Float64, TruePose
-from tilestream.settings import RegistrationSettings, StartSettings
+from tilestream.settings import LabelSettings, RegistrationSettings, StartSettings
 from tilestream.store import TileStore
 from tilestream.tables import read_tables, remove_others
 
@@ -63,7 +63,7 @@ def localize(
             a local path or any fsspec URL.
         cell_size: edge of an NDT cell [m].
         spacing: distance between sample points along the drive [m].
-        registration: the matcher; default `RegistrationSettings()`.
+        registration: the matcher; default `autoware`, as of all jobs.
         starts: the starts; default the paper's 317.
         true_pose: `log`, or `refined` as the paper does.
         scans: which scans to use; default all.
@@ -90,7 +90,7 @@ def localize(
         out,
         cell_size=cell_size,
         spacing=spacing,
-        registration=registration or RegistrationSettings(),
+        registration=registration or LabelSettings().registration,
         starts=starts or StartSettings(),
         true_pose=true_pose,
         scans=scans or ScanSelection(),
@@ -125,8 +125,8 @@ def plan_localize(
 
     Where a job has several logs, `group` names this one's labels: part of their keys and paths.
     """
-    reading = replace(reading, path=str(Path(reading.path).absolute()))
-    log = reading.open()
+    reading = _absolute(reading)
+    log = opened(reading)
     samples = choose_samples(log, scans, spacing)
     measuring = Measuring(cell_size, true_pose, registration, starts, reading.as_sensor)
     for size in measuring.cell_sizes:
@@ -155,6 +155,11 @@ def plan_localize(
     return Plan.of((*map_plan.tasks.values(), *tasks), memory)
 
 
+def _absolute(reading: Reading) -> Reading:
+    """With the whole path: workers may run elsewhere."""
+    return replace(reading, path=str(Path(reading.path).absolute()))
+
+
 def choose_samples(log: ScanLog, scans: ScanSelection, spacing: float) -> tuple[Sample, ...]:
     """One scan per `spacing` metres of the drive: the one nearest to each multiple of it.
 
@@ -177,6 +182,17 @@ def choose_samples(log: ScanLog, scans: ScanSelection, spacing: float) -> tuple[
         Sample(number, int(chosen[row]), int(log.stamps_ns[chosen[row]]), float(arc[row]))
         for number, row in enumerate(rows)
     )
+
+
+def labelled_places(reading: Reading, scans: ScanSelection, spacing: float) -> Float64:
+    """(k, 2) where a log says that the scans were taken that are localized [m, map frame].
+
+    Raises:
+        UsageError, SourceError: as `localize`.
+    """
+    log = opened(_absolute(reading))
+    samples = choose_samples(log, scans, spacing)
+    return log.T_map_lidar[[sample.scan for sample in samples], :2, 3]
 
 
 def tiles_in_reach(map_plan: MapPlan, places: Float64, reach: float) -> list[TileKey]:

@@ -9,20 +9,11 @@ simulate? -> scatter -> merge, cells, terms, factors, surfels, observe, register
 
 import json
 import os
-import platform
-import resource
 import shutil
-import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
-from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import joblib
-import numpy as np
 import yaml
 
 from tilestream.errors import PartialError, UsageError
@@ -35,112 +26,27 @@ from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.plan import Plan, paths_of
 from tilestream.pipeline.engine.stage import Task
 from tilestream.pipeline.jobs.ingest import Reading
+from tilestream.pipeline.jobs.run_book import Book, machine, told_before, write_text
 from tilestream.pipeline.jobs.run_findings import Done, findings_of
-from tilestream.pipeline.jobs.run_inputs import Inputs, check_model, inputs_of, read_map
+from tilestream.pipeline.jobs.run_inputs import (
+    Inputs,
+    check_model,
+    degraded_drives,
+    inputs_of,
+    read_map,
+)
 from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
-from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
+from tilestream.pipeline.jobs.run_settings import read_settings
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.samples import DatasetFile
 from tilestream.report import write_report
 from tilestream.report.summary import plain
+from tilestream.settings import RunSettings
 from tilestream.store import TileStore, open_store
 from tilestream.tables import remove_others
-from tilestream.version import VERSION
 
-WRITE_EVERY = 30.0
-"""How often `run.json` is written while tasks end [s]."""
 LARGE = 50_000
 """Measured places from which on a forest is grown by all workers together."""
-
-
-@dataclass
-class _Book:
-    """What a run did so far; `run.json` is made from it."""
-
-    folder: Path
-    earlier: Mapping[str, Any] = field(default_factory=dict)
-    """What it said after the calls before this one."""
-    began: float = field(default_factory=time.time)
-    written: float = 0.0
-    tasks: list[Task] = field(default_factory=list)
-    outcomes: list[Outcome] = field(default_factory=list)
-    failures: dict[str, str] = field(default_factory=dict)
-    facts: dict[str, Any] = field(default_factory=dict)
-
-    def listening(self, watch: Watch | None) -> Watch:
-        """What enters outcomes as they come, and tells `watch` of them.
-
-        It is written now and then, so that a call that is killed has told what it cost.
-        """
-
-        def hear(outcome: Outcome, ended: int, total: int) -> None:
-            self.outcomes.append(outcome)
-            if not outcome.ok:
-                self.failures[outcome.key] = outcome.reason
-            if time.time() - self.written > WRITE_EVERY:
-                self.write("running")
-            if watch is not None:
-                watch(outcome, ended, total)
-
-        return hear
-
-    @contextmanager
-    def closed(self) -> Iterator[None]:
-        """Where the job ends early, by an error or Ctrl-C, that is written, and why."""
-        try:
-            yield
-        except BaseException as error:
-            self.facts["stopped_by"] = str(error) or type(error).__name__
-            with suppress(OSError):  # on a full disk the reason itself matters more
-                self.write("stopped")
-            raise
-
-    def write(self, state: str) -> dict[str, Any]:
-        """Write `run.json`: whole, or as it was."""
-        content = {
-            "state": state,
-            "tilestream": VERSION,
-            **machine(),
-            "began": datetime.fromtimestamp(self.began, UTC).isoformat(timespec="seconds"),
-            "seconds": round(time.time() - self.began, 1),
-            "calls": self.calls,
-            "seconds_of_all_calls": self.seconds(),
-            "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1000,
-            "stages": self.stages(),
-            "failures": self.failures,
-            **self.facts,
-        }
-        _write_text(self.folder / "run.json", json.dumps(content, indent=2, default=str) + "\n")
-        self.written = time.time()
-        return content
-
-    @property
-    def calls(self) -> int:
-        """How often the job was called on this run directory, this call included."""
-        return int(self.earlier.get("calls", 0)) + 1
-
-    def seconds(self) -> float:
-        """How long all calls took [s]."""
-        before = float(self.earlier.get("seconds_of_all_calls", 0.0))
-        return round(before + time.time() - self.began, 1)
-
-    def stages(self) -> dict[str, dict[str, float]]:
-        """Tasks, failures and work of each stage in this call; its core-seconds in all calls."""
-        work = {task.key: task.work for task in self.tasks}
-        nothing = {"tasks": 0, "failed": 0, "work": 0, "core_seconds": 0.0}
-        before: dict[str, Any] = self.earlier.get("stages", {})
-        order = dict.fromkeys([*before, *(task.stage for task in self.tasks)])
-        table = {
-            stage: nothing | {"core_seconds": before.get(stage, nothing)["core_seconds"]}
-            for stage in order
-        }
-        for outcome in self.outcomes:
-            row = table[outcome.stage]
-            row["tasks"] += 1
-            row["failed"] += not outcome.ok
-            row["work"] += work[outcome.key]
-            row["core_seconds"] = round(row["core_seconds"] + outcome.seconds, 3)
-        return table
 
 
 def run(
@@ -209,7 +115,7 @@ def dataset(run_dir: str | os.PathLike[str]) -> Dataset:
     return DatasetFile(f"{os.fspath(run_dir)}/tables/samples/dataset.parquet").read()
 
 
-def _begin(settings: RunSettings) -> _Book:
+def _begin(settings: RunSettings) -> Book:
     """The run directory with the effective settings."""
     try:
         settings.folder.mkdir(parents=True, exist_ok=True)
@@ -218,31 +124,16 @@ def _begin(settings: RunSettings) -> _Book:
             f"{settings.out} is a file, or below one: name another run directory"
         ) from None
     text = yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
-    _write_text(settings.folder / "config.yaml", text)
-    book = _Book(settings.folder, _told_before(settings.folder / "run.json"))
+    write_text(settings.folder / "config.yaml", text)
+    book = Book(settings.folder, told_before(settings.folder / "run.json"))
     book.write("running")
     return book
-
-
-def _told_before(path: Path) -> dict[str, Any]:
-    """The book of earlier calls; empty where there is none, or none of this kind."""
-    try:
-        told = json.loads(path.read_text())
-    except (OSError, ValueError):
-        return {}
-    return told if isinstance(told, dict) and "calls" in told else {}
-
-
-def _write_text(path: Path, text: str) -> None:
-    part = path.with_name(f"{path.name}.part")
-    part.write_text(text)
-    part.replace(path)
 
 
 class _Story:
     """The job as it goes on: what is known after each part decides what the next one is."""
 
-    def __init__(self, settings: RunSettings, inputs: Inputs, book: _Book) -> None:
+    def __init__(self, settings: RunSettings, inputs: Inputs, book: Book) -> None:
         self.settings = settings
         self.inputs = inputs
         self.book = book
@@ -313,9 +204,9 @@ def _remove_other_tables(settings: RunSettings, measure: Plan) -> None:
         by_folder.setdefault(path.rsplit("/", 1)[0], []).append(path)
     for paths in by_folder.values():
         remove_others(paths)
-    for kind in ("errors", "starts"):
+    for kind, tables in (("errors", ""), ("starts", ""), ("drives", "/observability")):
         for folder in (settings.folder / "tables" / kind).glob("*/"):
-            if f"{settings.out}/tables/{kind}/{folder.name}" not in by_folder:
+            if f"{settings.out}/tables/{kind}/{folder.name}{tables}" not in by_folder:
                 shutil.rmtree(folder)
 
 
@@ -340,7 +231,7 @@ def _estimate_large(plan: Plan, client: Any | None, watch: Watch) -> None:
         execute(Plan(rest, plan.memory), client, watch)
 
 
-def _report(settings: RunSettings, inputs: Inputs, story: _Story, book: _Book) -> None:
+def _report(settings: RunSettings, inputs: Inputs, story: _Story, book: Book) -> None:
     """Gather what is done and write the report; without a single factor table there is none."""
     good = {outcome.key for outcome in book.outcomes if outcome.ok}
     done = Done(tuple(task for task in book.tasks if task.key in good))
@@ -359,13 +250,13 @@ def _report(settings: RunSettings, inputs: Inputs, story: _Story, book: _Book) -
         model=settings.model,
     )
     text = json.dumps(plain(evaluation), indent=1, allow_nan=False)
-    _write_text(settings.folder / "tables" / "evaluation.json", text + "\n")
+    write_text(settings.folder / "tables" / "evaluation.json", text + "\n")
     write_report(found, settings.folder / "report", threshold=settings.report.threshold)
     book.facts["report"] = str(settings.folder / "report" / "index.html")
 
 
 def _facts(
-    settings: RunSettings, inputs: Inputs, book: _Book, known: Dataset | None
+    settings: RunSettings, inputs: Inputs, book: Book, known: Dataset | None
 ) -> dict[str, Any]:
     """What a reader of the report must know of the run, and what makes the same figures again."""
     stages = {name: f"{row['core_seconds']:.1f} s" for name, row in book.stages().items()}
@@ -375,31 +266,34 @@ def _facts(
         "wall time, all calls [s]": book.seconds(),
         "calls": book.calls,
         "map": settings.store_url,
-        "sensor": settings.looking_sensor.name,
+        "sensor": settings.vehicle.name,
         "labelled places": 0 if known is None else len(known),
         "lost labels": {} if known is None else known.losses,
         "model": _model_facts(settings, book),
-        "matcher": settings.label.registration.model_dump(),
+        "matcher": {
+            "name": settings.label.registration.told,
+            **settings.label.registration.model_dump(),
+        },
         "settings": effective,
         "drives": {d.group: d.model_dump(exclude_defaults=True) for d in inputs.drives},
         "core-seconds by stage, all calls": stages,
         "failures": dict(book.failures),
-        "notes": list(inputs.notes),
+        "notes": [*inputs.notes, *_on_degraded(settings, inputs)],
         "attributions": list(inputs.attributions),
     }
 
 
-def machine() -> dict[str, Any]:
-    """What the figures were computed with."""
-    return {
-        "python": platform.python_version(),
-        "numpy": np.__version__,
-        "scikit-learn": version("scikit-learn"),
-        "cores": os.cpu_count(),
-    }
+def _on_degraded(settings: RunSettings, inputs: Inputs) -> list[str]:
+    """What a reader must know of drives that were read as another lidar than the vehicle's."""
+    others = degraded_drives(settings, inputs.drives)
+    groups = [drive.group for drive in inputs.drives if drive.degraded in others]
+    if not groups:
+        return []
+    told = f"observed as the lidar that they are read as: {', '.join(groups)}"
+    return [f"{told}; the estimates along the routes are for the vehicle as it is"]
 
 
-def _model_facts(settings: RunSettings, book: _Book) -> dict[str, Any]:
+def _model_facts(settings: RunSettings, book: Book) -> dict[str, Any]:
     """Where the model comes from, and how it was grown."""
     if settings.model.recipe == "physics":
         return {"from": "none: the virtual drive as it is", "offset [m]": settings.model.offset}

@@ -1,6 +1,6 @@
 """What the main job found: the tables of a run directory, gathered for its report."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from tilestream.errors import ModelError
+from tilestream.factors.virtual_drive import physics
 from tilestream.grid import MM_PER_M, Box
 from tilestream.model.dataset import TARGETS, Dataset
 from tilestream.model.evaluation import ceiling, factor_sets, figures_by_protocol
@@ -16,11 +17,11 @@ from tilestream.model.models import FORESTS
 from tilestream.model.training import MAIN, PREDICTION_COLUMNS
 from tilestream.pipeline.engine.plan import paths_of
 from tilestream.pipeline.engine.stage import Task
-from tilestream.pipeline.jobs.run_settings import ModelSettings
 from tilestream.pipeline.stages.evaluate import by_protocol
 from tilestream.pipeline.stages.samples import places_with_factors
 from tilestream.records import Float64
 from tilestream.report.data import AROUND, Findings
+from tilestream.settings import ModelSettings
 from tilestream.store import TileStore
 from tilestream.tables import read_tables, remove_others
 
@@ -46,6 +47,10 @@ class Done:
         """The joined dataset; None: nothing was measured, or it could not be joined."""
         joined = self.outputs("samples")
         return joined[0].writes.read() if joined else None
+
+    def seen_otherwise(self) -> list[str]:
+        """The groups of labels that were seen with another lidar than the vehicle's."""
+        return [group for task in self.outputs("samples") for group in task.takes.get("own_of", {})]
 
     def judgements(self) -> dict[tuple[str, str, str], dict[str, pd.DataFrame | str]]:
         """What was evaluated, by (target, competitor, factor set; empty: all factors)."""
@@ -86,7 +91,11 @@ def places_of(done: Done) -> pd.DataFrame:
 
 
 def labels_of(
-    dataset: Dataset | None, places: pd.DataFrame, points: pd.DataFrame | None
+    dataset: Dataset | None,
+    places: pd.DataFrame,
+    points: pd.DataFrame | None,
+    own: Collection[str] = (),
+    offset: float | None = None,
 ) -> pd.DataFrame:
     """The measured places, with what a model said of them that had not seen them.
 
@@ -95,6 +104,10 @@ def labels_of(
         places: every sample point.
         points: held-out points of the model that leaves paths out; None: the model in use was
             trained elsewhere, so that its estimates are held out as they are.
+        own: groups of labels that were seen with another lidar than the vehicle's, for which the
+            estimates of `places` are. Without `points` they have that of their own virtual drive,
+            and none by a model, which was trained for the vehicle's.
+        offset: without a model: what a real scan adds to the error of a virtual one [m].
     """
     if dataset is None:
         return pd.DataFrame()
@@ -104,7 +117,13 @@ def labels_of(
         said = points.rename(columns={"estimate": "held_out"})
     kept = ["held_out"] if points is not None else ["held_out", "low", "high"]
     said = said[["path", "arc_length", *kept]]
-    return dataset.rows.merge(said, on=["path", "arc_length"], how="left", validate="many_to_one")
+    found = dataset.rows.merge(said, on=["path", "arc_length"], how="left", validate="many_to_one")
+    if points is None and own:
+        others = found["group"].isin(list(own))
+        found.loc[others, kept] = np.nan
+        if offset is not None:
+            found.loc[others, "held_out"] = physics(found["vd_mean"][others].to_numpy(), offset)
+    return found
 
 
 def evaluation_of(
@@ -183,7 +202,13 @@ def findings_of(
     gathered = Findings(
         title=title,
         places=places,
-        labels=labels_of(dataset, places, points if trained_here else None),
+        labels=labels_of(
+            dataset,
+            places,
+            points if trained_here else None,
+            done.seen_otherwise(),
+            model.offset if model.recipe == "physics" else None,
+        ),
         protocols=tables["protocols"],
         table_iv=tables["table_iv"],
         importances=weighed[weighed["factor"] != ""].reset_index(drop=True),

@@ -1,13 +1,12 @@
 """What the main job works on: its settings and files."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from glob import glob
 from pathlib import Path
 from typing import Any
 
 from tilestream.errors import ModelError, SourceNotFoundError, UsageError
-from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.formats.logs import ScanSelection, is_log
 from tilestream.formats.routes import read_routes
 from tilestream.model.dataset import made_with
@@ -15,13 +14,21 @@ from tilestream.model.model_file import load_model
 from tilestream.model.training import check_making
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.jobs.ingest import Reading, read_sources
-from tilestream.pipeline.jobs.run_settings import DriveSettings, RunSettings, SimulateSettings
 from tilestream.pipeline.jobs.simulate import simulate
 from tilestream.pipeline.stages.drive_scans import Reading as DriveReading
 from tilestream.pipeline.stages.observe import Observing
 from tilestream.pipeline.stages.samples import COLUMNS
 from tilestream.records import Route
-from tilestream.settings import IngestSettings
+from tilestream.sensor import Sensor
+from tilestream.settings import (
+    DriveSettings,
+    IngestSettings,
+    LogSettings,
+    MapSettings,
+    RunSettings,
+    SimulateSettings,
+    VirtualSettings,
+)
 from tilestream.simulation.settings import SimulationSettings, load_preset
 from tilestream.store import open_store
 
@@ -154,7 +161,7 @@ def read_map(settings: RunSettings, inputs: Inputs) -> Reading | None:
     return read_sources(
         inputs.sources,
         settings.store_url,
-        ingest_settings(settings),
+        ingest_settings(settings.map),
         settings.memory,
         settings.map.points_topic,
         settings.map.pose_topic,
@@ -162,17 +169,25 @@ def read_map(settings: RunSettings, inputs: Inputs) -> Reading | None:
     )
 
 
-def ingest_settings(settings: RunSettings) -> IngestSettings:
-    """How the map is cut into tiles."""
-    names = set(IngestSettings.model_fields)
-    return IngestSettings(**settings.map.model_dump(include=names))
+def ingest_settings(settings: MapSettings) -> IngestSettings:
+    """How a map is cut into tiles."""
+    return IngestSettings(**settings.model_dump(include=set(IngestSettings.model_fields)))
 
 
 def map_scans(settings: RunSettings, inputs: Inputs) -> ScanSelection | None:
     """Which scans of logs become the map; None: there are no logs among the sources."""
     if any(map(is_log, inputs.sources)):
-        return ScanSelection(every=settings.map.every, offset=settings.map.offset)
+        return scans_of(settings.map)
     return None
+
+
+def scans_of(log: LogSettings) -> ScanSelection:
+    """Which scans of a log are used.
+
+    Raises:
+        UsageError: an offset that is not below `every`.
+    """
+    return ScanSelection(every=log.every, offset=log.offset, from_s=log.from_s, until_s=log.until_s)
 
 
 def is_simulated(settings: RunSettings) -> bool:
@@ -186,7 +201,7 @@ def is_simulated(settings: RunSettings) -> bool:
 def observing_of(settings: RunSettings, seeing: VirtualSettings) -> Observing:
     """What the virtual drive is made with: the vehicle's lidar and its matcher."""
     return Observing(
-        settings.looking_sensor,
+        settings.vehicle,
         seeing,
         settings.label.registration,
         settings.cell_size,
@@ -194,9 +209,46 @@ def observing_of(settings: RunSettings, seeing: VirtualSettings) -> Observing:
     )
 
 
+def observing_drive(
+    settings: RunSettings, seeing: VirtualSettings, drive: DriveSettings
+) -> Observing:
+    """What a drive is observed with: the vehicle's lidar, as far as the drive is read as a lesser
+    one; that of the vehicle itself where it is not.
+
+    Raises:
+        UsageError: fewer beams of a vehicle of several sensors.
+    """
+    vehicle = observing_of(settings, seeing)
+    changes: dict[str, float] = {}
+    if drive.range_max is not None and drive.range_max < vehicle.range_max:
+        changes["range_max"] = drive.range_max
+    if drive.blind_rear_deg is not None and drive.blind_rear_deg > seeing.blind_rear_deg:
+        changes["blind_rear_deg"] = drive.blind_rear_deg
+    sensor = vehicle.sensor
+    if drive.beams is not None:
+        if not isinstance(sensor, Sensor):
+            raise UsageError(
+                f"drive {drive.group} has beams, of one lidar: the vehicle has several"
+            )
+        sensor = sensor.with_beams(drive.beams)
+    return replace(vehicle, sensor=sensor, seeing=seeing.model_copy(update=changes))
+
+
+def degraded_drives(settings: RunSettings, drives: Sequence[DriveSettings]) -> dict[str, Observing]:
+    """What the drives are observed with that are read as another lidar than the vehicle's, by
+    `DriveSettings.degraded`.
+    """
+    if settings.observe is None:
+        return {}
+    vehicle = observing_of(settings, settings.observe)
+    found = {d.degraded: observing_drive(settings, settings.observe, d) for d in drives}
+    return {name: observing for name, observing in found.items() if observing != vehicle}
+
+
 def making_of(settings: RunSettings) -> dict[str, Any]:
     """What the factors are made with, as a model remembers it."""
     making = made_with(COLUMNS, settings.looking_sensor, settings.cell_size)
+    making |= {"sensor": settings.vehicle.model_dump(mode="json")}
     making |= {"sensor_height": settings.sensor_height, "map_leaf": _map_leaf(settings)}
     if settings.observe is None:
         return making
@@ -239,7 +291,7 @@ def reading_of(drive: DriveSettings) -> DriveReading:
         SourceNotFoundError: there is no such log.
     """
     if not Path(drive.log).is_file():
-        raise SourceNotFoundError(f"{drive.log}: no such log; see drives in the config")
+        raise SourceNotFoundError(f"{drive.log}: no such log")
     return DriveReading(
         drive.log,
         drive.points_topic,

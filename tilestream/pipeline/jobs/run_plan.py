@@ -1,14 +1,15 @@
 """What the main job runs: tiles, factors and errors; then what is learnt of them."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from typing import Any
 
+import numpy as np
+
 from tilestream.factors import catalogue
-from tilestream.factors.rows import samples_by_tile
+from tilestream.factors.rows import Samples, samples_by_tile
 from tilestream.factors.virtual_drive import NEIGHBOURS
-from tilestream.formats.logs import ScanSelection
 from tilestream.grid import MM_PER_M, TileGrid, TileKey
-from tilestream.model.dataset import TARGETS, features_of
+from tilestream.model.dataset import TARGETS, TOLERANCE, features_of
 from tilestream.model.evaluation import factor_sets
 from tilestream.model.models import COMPETITORS, PHYSICS
 from tilestream.model.training import MAIN
@@ -17,21 +18,32 @@ from tilestream.pipeline.engine.outputs import Parquet
 from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.engine.stage import Readable, Task
 from tilestream.pipeline.jobs.along_routes import plan_factors, plan_observe
-from tilestream.pipeline.jobs.localize import plan_localize
-from tilestream.pipeline.jobs.run_inputs import Inputs, making_of, observing_of, reading_of
-from tilestream.pipeline.jobs.run_settings import RunSettings
+from tilestream.pipeline.jobs.localize import labelled_places, plan_localize
+from tilestream.pipeline.jobs.run_inputs import (
+    Inputs,
+    degraded_drives,
+    making_of,
+    observing_of,
+    reading_of,
+    scans_of,
+)
 from tilestream.pipeline.stages.evaluate import evaluate
 from tilestream.pipeline.stages.factors import Looking
 from tilestream.pipeline.stages.importance import importance
 from tilestream.pipeline.stages.map_plan import MapPlan
+from tilestream.pipeline.stages.observe import observe_drive
 from tilestream.pipeline.stages.predict import predict
 from tilestream.pipeline.stages.samples import COLUMNS, DatasetFile, samples
 from tilestream.pipeline.stages.train import ModelFile, ModelInUse, train
+from tilestream.settings import RunSettings
 
 OPPONENT = "training median"
 """Whom a part of the error is judged against: the others know no more of unseen paths."""
 NEIGHBOURS_MM = round(NEIGHBOURS * MM_PER_M) + 1
 """How far from a tile a sample point of it may have neighbours, rounding included [mm]."""
+BESIDE = TOLERANCE + NEIGHBOURS + 1.0
+"""How far from a labelled place sample points may matter [m]: the one that it takes its factors
+from, that one's neighbours, and what a refined true pose moves."""
 
 
 def plan_measure(settings: RunSettings, inputs: Inputs, map_plan: MapPlan) -> Plan:
@@ -50,27 +62,54 @@ def plan_measure(settings: RunSettings, inputs: Inputs, map_plan: MapPlan) -> Pl
     if settings.observe is not None:
         observing = observing_of(settings, settings.observe)
         plans.append(plan_observe(map_plan, places, tables, observing, memory))
-    for drive in inputs.drives:
-        scans = ScanSelection(
-            every=drive.every, offset=drive.offset, from_s=drive.from_s, until_s=drive.until_s
+        plans += _observed_drives(settings, inputs, map_plan, places)
+    plans += [
+        plan_localize(
+            map_plan,
+            reading_of(drive),
+            tables,
+            cell_size=settings.cell_size,
+            spacing=settings.spacing,
+            registration=settings.label.registration,
+            starts=settings.label.starts,
+            true_pose=settings.label.true_pose,
+            scans=scans_of(drive),
+            starts_per_task=None,
+            memory=memory,
+            group=drive.group,
         )
-        plans.append(
-            plan_localize(
-                map_plan,
-                reading_of(drive),
-                tables,
-                cell_size=settings.cell_size,
-                spacing=settings.spacing,
-                registration=settings.label.registration,
-                starts=settings.label.starts,
-                true_pose=settings.label.true_pose,
-                scans=scans,
-                starts_per_task=None,
-                memory=memory,
-                group=drive.group,
-            )
-        )
+        for drive in inputs.drives
+    ]
     return Plan.of((task for plan in plans for task in plan.tasks), memory)
+
+
+def _observed_drives(
+    settings: RunSettings,
+    inputs: Inputs,
+    map_plan: MapPlan,
+    places: Mapping[TileKey, Samples],
+) -> Iterator[Plan]:
+    """The labelled places of drives that are read as another lidar than the vehicle's, as seen by
+    that one.
+    """
+    for name, observing in degraded_drives(settings, inputs.drives).items():
+        labelled = np.concatenate(
+            [
+                labelled_places(reading_of(drive), scans_of(drive), settings.spacing)
+                for drive in inputs.drives
+                if drive.degraded == name
+            ]
+        )
+        near = {key: samples.near(labelled, BESIDE) for key, samples in places.items()}
+        yield plan_observe(
+            map_plan,
+            {key: samples for key, samples in near.items() if len(samples)},
+            f"{settings.out}/tables/drives/{name}",
+            observing,
+            settings.memory,
+            name,
+            observe_drive,
+        )
 
 
 def plan_estimate(
@@ -90,10 +129,12 @@ def plan_estimate(
     if settings.observe is not None:
         seen = {task.tile for task in observed}
         factors = [task for task in factors if task.tile in seen]
+    own = _observed_of_drives(settings, measure, done)
+    labels = [task for task in labels if own.get(_group(task), True)]
     tasks: list[Task] = []
     known, model = _model_there(settings)
     if labels and factors:
-        joined = _samples(settings, factors, observed, labels)
+        joined = _samples(settings, factors, observed, labels, own)
         tasks.append(joined)
         if not known:
             training = _training(settings, joined)
@@ -103,6 +144,25 @@ def plan_estimate(
     if known:
         tasks += _predictions(settings, grid, factors, observed, model)
     return Plan.of(tasks, settings.memory)
+
+
+def _observed_of_drives(
+    settings: RunSettings, measure: Plan, done: Set[str]
+) -> dict[str, tuple[Task, ...]]:
+    """What is done of the virtual drives of each drive that is read as another lidar than the
+    vehicle's, by the group of its labels.
+    """
+    found = {}
+    for drive in settings.drives:
+        folder = f"{settings.out}/tables/drives/{drive.degraded}/"
+        tasks = [
+            task
+            for task in measure.outputs(observe_drive.name)
+            if isinstance(task.writes, Parquet) and task.writes.path.startswith(folder)
+        ]
+        if tasks:
+            found[drive.group] = tuple(task for task in tasks if task.key in done)
+    return found
 
 
 def _model_there(settings: RunSettings) -> tuple[bool, Readable | None]:
@@ -119,20 +179,29 @@ def _samples(
     factors: Sequence[Task],
     observed: Sequence[Task],
     labels: Sequence[Task],
+    own: Mapping[str, Sequence[Task]],
 ) -> Task:
+    takes: dict[str, Any] = {
+        "groups": tuple(_group(task) for task in labels),
+        "making": making_of(settings),
+    }
+    reads = {
+        "factors": _products(factors),
+        "observed": _products(observed),
+        "labels": _products(labels),
+    }
+    tables = list(dict.fromkeys(task for tasks in own.values() for task in tasks))
+    if tables:
+        reads["own"] = _products(tables)
+        takes["own_of"] = {
+            group: [tables.index(task) for task in tasks] for group, tasks in own.items() if tasks
+        }
     return Task(
         samples,
         "dataset",
         DatasetFile(f"{settings.out}/tables/samples/dataset.parquet"),
-        takes={
-            "groups": tuple(_group(task) for task in labels),
-            "making": making_of(settings),
-        },
-        reads={
-            "factors": _products(factors),
-            "observed": _products(observed),
-            "labels": _products(labels),
-        },
+        takes=takes,
+        reads=reads,
         work=sum(task.work for task in labels),
         counts={"places": sum(task.work for task in (*factors, *labels))},
     )

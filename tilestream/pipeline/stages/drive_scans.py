@@ -140,6 +140,11 @@ class OpenedScans:
         return self.wanted.reading.seen(scan, self.log)
 
 
+def opened(reading: Reading) -> ScanLog:
+    """A log; a process reads it through once while the file stays as it is."""
+    return _opened(reading, reading.state)
+
+
 @lru_cache(maxsize=4)
 def _opened(reading: Reading, state: str) -> ScanLog:  # noqa: ARG001 - a changed file is another
     return reading.open()

@@ -6,15 +6,14 @@ import pandas as pd
 
 from tilestream.factors.observability import COLUMNS, MARGIN, observability
 from tilestream.factors.rows import PLACE_COLUMNS, STATUS_COLUMNS, Samples, sample_rows
-from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.grid import Box, TileKey, whole_mm
 from tilestream.marks import canonical
 from tilestream.pipeline.engine.outputs import Made, Parquet
-from tilestream.pipeline.engine.stage import Task, stage
+from tilestream.pipeline.engine.stage import Stage, Task, stage
 from tilestream.pipeline.stages.map_part import MapPart
 from tilestream.pipeline.stages.map_plan import MapPlan
-from tilestream.sensor import Sensor
-from tilestream.settings import RegistrationSettings
+from tilestream.sensor import Carrier, rim_of
+from tilestream.settings import RegistrationSettings, VirtualSettings
 
 FIXED_BYTES = 600_000_000
 """Memory of the task besides what it reads: a scene, the registrations, and the terms that factors
@@ -27,7 +26,7 @@ BYTES_PER_POINT = 60
 class Observing:
     """What is observed with: the identity of a table of observability."""
 
-    sensor: Sensor
+    sensor: Carrier
     """What looks."""
     seeing: VirtualSettings
     """How it sees, and where the virtual drive starts."""
@@ -43,6 +42,11 @@ class Observing:
         """How far it sees [m]."""
         usable = self.seeing.range_max
         return self.sensor.range_max if usable is None else min(usable, self.sensor.range_max)
+
+    @property
+    def reach(self) -> float:
+        """How far from the sample point what it sees can be [m]."""
+        return self.range_max + rim_of(self.sensor)
 
 
 @stage(
@@ -68,6 +72,19 @@ def observe(map_part: MapPart, samples: Samples, observing: Observing) -> Made:
     return Made(pd.concat([frame, found], axis=1), {"data_set": canonical(observing)})
 
 
+@stage(
+    "observe_drive",
+    version=observe.version,
+    memory=observe.memory,
+    seconds=observe.seconds,
+    columns=observe.columns,
+)
+def observe_drive(map_part: MapPart, samples: Samples, observing: Observing) -> Made:
+    """The same as the lidar sees that a drive is read as: what its labels are joined with."""
+    made: Made = observe.function(map_part, samples, observing)
+    return made
+
+
 def observe_task(
     plan: MapPlan,
     tile: TileKey,
@@ -75,6 +92,7 @@ def observe_task(
     observing: Observing,
     folder: str,
     group: str = "",
+    applies: Stage = observe,
 ) -> Task:
     """The observability of the sample points of a tile, from surfels and cells of those in sight.
 
@@ -85,12 +103,13 @@ def observe_task(
         observing: what is observed with.
         folder: of the tables.
         group: as whose sensor, where one plan observes with several.
+        applies: `observe`, or `observe_drive`.
     """
     cell_mm = whole_mm(observing.cell_size, "cell_size")
-    seen = plan.over(Box.around(samples.places, observing.range_max + MARGIN))
+    seen = plan.over(Box.around(samples.places, observing.reach + MARGIN))
     made = [task for k in seen for task in (plan.cells(k, cell_mm), plan.surfels(k))]
     return Task(
-        observe,
+        applies,
         "-".join(part for part in (group, str(tile)) if part),
         Parquet(f"{folder}/observability/{tile}.parquet"),
         takes={"samples": samples, "observing": observing},

@@ -1,6 +1,6 @@
 """Samples: the factors, virtual drives and labels of the same places, joined once."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -112,6 +112,8 @@ def samples(
     labels: Sequence[Stored],
     groups: Sequence[str],
     making: dict[str, Any],
+    own: Sequence[Stored] = (),
+    own_of: Mapping[str, Sequence[int]] | None = None,
 ) -> Dataset:
     """The factors and the errors of the same places as one dataset.
 
@@ -121,6 +123,9 @@ def samples(
         labels: tables of errors.
         groups: of each table of errors, which drive it is of, as whose sensor.
         making: what the factors were computed with.
+        own: tables of observability as the lidars see that drives are read as.
+        own_of: which of these belong to a group; a group that is not there is of the vehicle's
+            lidar.
     """
     of_group: dict[str, list[Stored]] = {}
     for group, table in zip(groups, labels, strict=True):
@@ -128,7 +133,18 @@ def samples(
     rows = {name: _rows(tables) for name, tables in of_group.items()}
     data_sets = {name: tables[0].facts["data_set"] for name, tables in of_group.items()}
     places = places_with_factors(factors, observed)
-    return join(places, rows, COLUMNS, made_with=making, data_sets=data_sets)
+    seen_otherwise = {
+        group: places_with_factors(factors, [own[number] for number in numbers])
+        for group, numbers in (own_of or {}).items()
+    }
+    return join(
+        places,
+        rows,
+        COLUMNS,
+        own_factors=seen_otherwise,
+        made_with=making,
+        data_sets=data_sets,
+    )
 
 
 def places_with_factors(factors: Sequence[Stored], observed: Sequence[Stored]) -> pd.DataFrame:

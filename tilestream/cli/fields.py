@@ -1,0 +1,113 @@
+"""Options of commands that are made from the fields of settings: name, type, default and help."""
+
+import functools
+import inspect
+import types
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import typer
+from pydantic.fields import FieldInfo
+
+from tilestream.config import Settings
+
+OLD_FLAGS = {"range_max": "max-range", "blind_rear_deg": "blind-rear", "sweep_s": "sweep"}
+"""Flags of version 0.1 that are still taken, by the setting that they are now called after."""
+
+
+@dataclass(frozen=True)
+class Fields:
+    """Which fields of settings a command has as options."""
+
+    names: tuple[str, ...]
+    """The fields; the others keep their defaults."""
+    own: dict[str, Any] = field(default_factory=dict)
+    """Defaults that the command has of its own."""
+
+
+def fields(*names: str, **own: Any) -> Fields:
+    """Marks an argument of a command: these fields of its settings are options.
+
+    Args:
+        names: the fields.
+        own: defaults of the command's own.
+    """
+    return Fields(names, own)
+
+
+def with_settings(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command an option for each field of the settings that it takes.
+
+    An argument `Annotated[SomeSettings, fields(…)]` becomes these options; the command gets the
+    settings that they make.
+
+    Raises:
+        UsageError: when the command runs, values that the settings refuse.
+    """
+    hints = get_type_hints(command, include_extras=True)
+    groups: dict[str, tuple[type[Settings], Fields]] = {}
+    parameters: list[inspect.Parameter] = []
+    for parameter in inspect.signature(command).parameters.values():
+        hint = hints[parameter.name]
+        chosen = [part for part in get_args(hint) if isinstance(part, Fields)]
+        if chosen:
+            model = get_args(hint)[0]
+            groups[parameter.name] = model, chosen[0]
+            parameters += [_option(model, name, chosen[0].own) for name in chosen[0].names]
+        else:
+            parameters.append(parameter.replace(annotation=hint))
+
+    @functools.wraps(command)
+    def wrapped(**values: Any) -> None:
+        for group, (model, chosen) in groups.items():
+            values[group] = model(**{name: values.pop(name) for name in chosen.names})
+        command(**values)
+
+    first = [p for p in parameters if p.default is inspect.Parameter.empty]
+    rest = [p for p in parameters if p.default is not inspect.Parameter.empty]
+    wrapped.__signature__ = inspect.Signature([*first, *rest])  # type: ignore[attr-defined]
+    return wrapped
+
+
+def _option(model: type[Settings], name: str, own: dict[str, Any]) -> inspect.Parameter:
+    """The option of a field: `--its-name`, with its default and its docstring as help; what has no
+    default is an argument.
+    """
+    known = model.model_fields[name]
+    needed = known.is_required()
+    flags = [f"--{flag}" for flag in (name.replace("_", "-"), OLD_FLAGS.get(name)) if flag]
+    how: Any = (
+        typer.Argument(help=help_of(known)) if needed else typer.Option(*flags, help=help_of(known))
+    )
+    return inspect.Parameter(
+        name,
+        inspect.Parameter.POSITIONAL_OR_KEYWORD,
+        default=inspect.Parameter.empty if needed else own.get(name, known.default),
+        annotation=Annotated[_type_of(known), how],
+    )
+
+
+def help_of(known: FieldInfo) -> str:
+    """The docstring of a field on one line."""
+    return " ".join((known.description or "").split())
+
+
+def _type_of(known: FieldInfo) -> Any:
+    """What a field takes on a command line: a text where it takes settings or an amount."""
+    if isinstance(known.default, str) and get_origin(known.annotation) is not Literal:
+        texts = [part for part in _parts(known.annotation) if get_origin(part) is Literal]
+        return texts[0] if texts else str
+    kinds = [_plain(part) for part in _parts(known.annotation)]
+    return kinds[0] if len(kinds) == 1 else Union[tuple(kinds)]  # noqa: UP007 - made at run time
+
+
+def _parts(annotation: Any) -> tuple[Any, ...]:
+    """The members of a union; of anything else itself."""
+    united = get_origin(annotation) in (Union, types.UnionType)
+    return get_args(annotation) if united else (annotation,)
+
+
+def _plain(annotation: Any) -> Any:
+    """A type without its limits, which the settings check."""
+    return get_args(annotation)[0] if get_origin(annotation) is Annotated else annotation

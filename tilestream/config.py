@@ -1,0 +1,52 @@
+"""What all settings are: frozen pydantic models; unknown keys refused.
+
+The docstring of a field is its documentation: meaning, and the unit in brackets. `tilestream
+explain` and the help of the command line print it.
+"""
+
+import difflib
+import re
+from collections.abc import Iterator
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from tilestream.errors import UsageError
+
+NESTED = re.compile(r" \w+Settings: ")
+"""How settings inside others begin what is wrong with them: the key above says which they are."""
+
+
+class Settings(BaseModel):
+    """Base of all settings: frozen; an unknown key is an error at every level.
+
+    Raises:
+        UsageError: a value that cannot be; names each key and what is wrong with it.
+    """
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
+    )
+
+    def __init__(self, **values: Any) -> None:
+        try:
+            super().__init__(**values)
+        except ValidationError as error:
+            raise UsageError(
+                f"{type(self).__name__}: "
+                + "; ".join(_readable(error, list(type(self).model_fields)))
+            ) from None
+
+
+def _readable(error: ValidationError, known: list[str]) -> Iterator[str]:
+    for problem in error.errors():
+        key = ".".join(str(part) for part in problem["loc"])
+        if problem["type"] == "extra_forbidden":
+            near = difflib.get_close_matches(key, known, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
+            yield f"{key} is no setting: {hint}"
+        elif problem["type"] == "value_error":
+            said = problem["msg"].removeprefix("Value error, ")
+            yield NESTED.sub(": ", f"{key} {said}").strip()
+        else:
+            yield f"{key} is {problem['input']!r}: {problem['msg']}"

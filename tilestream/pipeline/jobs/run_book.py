@@ -1,0 +1,140 @@
+"""The book of a run: what it did so far, kept in `run.json`."""
+
+import json
+import os
+import platform
+import resource
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tilestream.pipeline.engine.attempt import Outcome
+from tilestream.pipeline.engine.executor import Watch
+from tilestream.pipeline.engine.stage import Task
+from tilestream.version import VERSION
+
+WRITE_EVERY = 30.0
+"""How often `run.json` is written while tasks end [s]."""
+
+
+@dataclass
+class Book:
+    """What a run did so far; `run.json` is made from it."""
+
+    folder: Path
+    earlier: Mapping[str, Any] = field(default_factory=dict)
+    """What it said after the calls before this one."""
+    began: float = field(default_factory=time.time)
+    written: float = 0.0
+    tasks: list[Task] = field(default_factory=list)
+    outcomes: list[Outcome] = field(default_factory=list)
+    failures: dict[str, str] = field(default_factory=dict)
+    facts: dict[str, Any] = field(default_factory=dict)
+
+    def listening(self, watch: Watch | None) -> Watch:
+        """What enters outcomes as they come, and tells `watch` of them.
+
+        It is written now and then, so that a call that is killed has told what it cost.
+        """
+
+        def hear(outcome: Outcome, ended: int, total: int) -> None:
+            self.outcomes.append(outcome)
+            if not outcome.ok:
+                self.failures[outcome.key] = outcome.reason
+            if time.time() - self.written > WRITE_EVERY:
+                self.write("running")
+            if watch is not None:
+                watch(outcome, ended, total)
+
+        return hear
+
+    @contextmanager
+    def closed(self) -> Iterator[None]:
+        """Where the job ends early, by an error or Ctrl-C, that is written, and why."""
+        try:
+            yield
+        except BaseException as error:
+            self.facts["stopped_by"] = str(error) or type(error).__name__
+            with suppress(OSError):  # on a full disk the reason itself matters more
+                self.write("stopped")
+            raise
+
+    def write(self, state: str) -> dict[str, Any]:
+        """Write `run.json`: whole, or as it was."""
+        content = {
+            "state": state,
+            "tilestream": VERSION,
+            **machine(),
+            "began": datetime.fromtimestamp(self.began, UTC).isoformat(timespec="seconds"),
+            "seconds": round(time.time() - self.began, 1),
+            "calls": self.calls,
+            "seconds_of_all_calls": self.seconds(),
+            "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1000,
+            "stages": self.stages(),
+            "failures": self.failures,
+            **self.facts,
+        }
+        write_text(self.folder / "run.json", json.dumps(content, indent=2, default=str) + "\n")
+        self.written = time.time()
+        return content
+
+    @property
+    def calls(self) -> int:
+        """How often the job was called on this run directory, this call included."""
+        return int(self.earlier.get("calls", 0)) + 1
+
+    def seconds(self) -> float:
+        """How long all calls took [s]."""
+        before = float(self.earlier.get("seconds_of_all_calls", 0.0))
+        return round(before + time.time() - self.began, 1)
+
+    def stages(self) -> dict[str, dict[str, float]]:
+        """Tasks, failures and work of each stage in this call; its core-seconds in all calls."""
+        work = {task.key: task.work for task in self.tasks}
+        nothing = {"tasks": 0, "failed": 0, "work": 0, "core_seconds": 0.0}
+        before: dict[str, Any] = self.earlier.get("stages", {})
+        order = dict.fromkeys([*before, *(task.stage for task in self.tasks)])
+        table = {
+            stage: nothing | {"core_seconds": before.get(stage, nothing)["core_seconds"]}
+            for stage in order
+        }
+        for outcome in self.outcomes:
+            row = table[outcome.stage]
+            row["tasks"] += 1
+            row["failed"] += not outcome.ok
+            row["work"] += work[outcome.key]
+            row["core_seconds"] = round(row["core_seconds"] + outcome.seconds, 3)
+        return table
+
+
+def told_before(path: Path) -> dict[str, Any]:
+    """The book of earlier calls; empty where there is none, or none of this kind."""
+    try:
+        told = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    return told if isinstance(told, dict) and "calls" in told else {}
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file: whole, or as it was."""
+    part = path.with_name(f"{path.name}.part")
+    part.write_text(text)
+    part.replace(path)
+
+
+def machine() -> dict[str, Any]:
+    """What the figures were computed with."""
+    return {
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "scikit-learn": version("scikit-learn"),
+        "cores": os.cpu_count(),
+    }
