@@ -35,11 +35,11 @@ from tilestream.errors import (
     UsageError,
 )
 from tilestream.factors.virtual_scan import VirtualSettings
-from tilestream.model import evaluation, models, training
+from tilestream.model import evaluation, forest, registry, training
 from tilestream.model.dataset import TARGETS
+from tilestream.model.file import load_model, save_model
+from tilestream.model.forest import Growth
 from tilestream.model.intervals import coverage
-from tilestream.model.model_file import load_model, save_model
-from tilestream.model.models import Recipe
 from tilestream.model.training import PREDICTION_COLUMNS
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.cluster import dask_client
@@ -97,14 +97,10 @@ def small_forests(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        quick = Recipe(trees=5)
-        patch.setattr(models, "PAPER", quick)
-        patch.setattr(models, "CANDIDATES", (Recipe(trees=4, leaf=2, log=True),))
-        patch.setattr(training, "PAPER", quick)
-        patch.delitem(models.COMPETITORS, "mlp")  # a thousand passes over the data
+        patch.setattr(forest, "PAPER", Growth(trees=5))
+        patch.setattr(forest, "CANDIDATES", (Growth(trees=4, leaf=2, log=True),))
+        patch.delitem(registry.COMPETITORS, "mlp")  # a thousand passes over the data
         patch.setattr(pictures.png, "__defaults__", (20,))
-        patch.setattr(evaluation.importances, "__defaults__", ("error_mean", quick, 0))
-        patch.setattr(evaluation.criterion_importances, "__defaults__", ("error_mean", quick, 0))
         yield
 
 
@@ -210,7 +206,7 @@ def test_the_evaluation_has_every_protocol_and_opponent(done: tuple[Path, Told])
     found = json.loads((done[0] / "tables" / "evaluation.json").read_text())
     protocols = pd.DataFrame(found["protocols"])
     judged = protocols[protocols["reason"] == ""]
-    assert set(judged["model"]) == set(models.COMPETITORS) - set(models.PHYSICS)
+    assert set(judged["model"]) == set(registry.COMPETITORS) - {registry.UNTRAINED}
     assert {"paper", "path"} <= set(judged["protocol"])
     assert set(protocols["protocol"]) == {"paper", "path", "blocks"}
     blocks = protocols[protocols["protocol"] == "blocks"]

@@ -27,7 +27,7 @@ import yaml
 
 from tilestream.errors import PartialError, UsageError
 from tilestream.model.dataset import Dataset
-from tilestream.model.model_file import load_model
+from tilestream.model.file import load_model
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.cluster import report_kept
 from tilestream.pipeline.engine.costs import learn
@@ -401,7 +401,7 @@ def machine() -> dict[str, Any]:
 
 def _model_facts(settings: RunSettings, book: _Book) -> dict[str, Any]:
     """Where the model comes from, and how it was grown."""
-    if settings.model.recipe == "physics":
+    if settings.model.untrained:
         return {"from": "none: the virtual drive as it is", "offset [m]": settings.model.offset}
     if settings.model.use is not None:
         return {"from": settings.model.use, **load_model(settings.model.use).facts}

@@ -11,7 +11,7 @@ from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.formats.logs.mcap import ScanSelection
 from tilestream.formats.routes import read_routes
 from tilestream.model.dataset import made_with
-from tilestream.model.model_file import load_model
+from tilestream.model.file import load_model
 from tilestream.model.training import check_making
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.jobs.ingest import Reading, read_sources

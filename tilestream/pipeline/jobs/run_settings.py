@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import Annotated, Literal, Self
 
 import yaml
-from pydantic import Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from tilestream.errors import SourceNotFoundError, UsageError
 from tilestream.factors.virtual_scan import VirtualSettings
+from tilestream.model.registry import COMPETITORS, DEFAULT, RECIPES, UNTRAINED
 from tilestream.records import TruePose
 from tilestream.sensor import SENSORS, Sensor
 from tilestream.settings import IngestSettings, RegistrationSettings, Settings, StartSettings
@@ -21,6 +22,24 @@ MATCHERS = {
     "default": RegistrationSettings(),
     "autoware": RegistrationSettings.autoware(),
 }
+
+
+def _known(recipe: str) -> str:
+    if recipe not in RECIPES:
+        raise ValueError(f"is {recipe!r}: choose from {', '.join(RECIPES)}")
+    return recipe
+
+
+Recipe = Annotated[
+    str,
+    AfterValidator(_known),
+    Field(
+        description="What estimates the error: "
+        + "; ".join(f"`{name}` ({COMPETITORS[name].words})" for name in RECIPES)
+        + f". All but `{UNTRAINED}` are trained on the drives."
+    ),
+]
+"""Name of a regressor."""
 
 
 class SimulateSettings(Settings):
@@ -62,7 +81,7 @@ class MapSettings(IngestSettings):
 
 
 class DriveSettings(Settings):
-    """A log on which errors are measured, maybe through a lesser sensor."""
+    """A log on which errors are measured, maybe as if through a sensor that sees less."""
 
     log: str
     """An MCAP log with point clouds and poses."""
@@ -116,15 +135,18 @@ class LabelSettings(Settings):
 class ModelSettings(Settings):
     """How the errors of the measured places become those of all places."""
 
-    recipe: Literal["default", "paper", "physics"] = "default"
-    """Ours, tuned on held-out blocks; the paper's forest; or no forest and no training: the virtual
-    drive as it is."""
+    recipe: Recipe = DEFAULT
     offset: Annotated[float, Field(ge=0.0)] = 0.0
     """With `physics`: what a real scan adds to the error of a virtual one [m]."""
     use: str | None = None
     """A model file to use instead of training; null: train on the drives."""
     seed: int = 0
-    """Seed of the forests."""
+    """Seed of all that is random in training."""
+
+    @property
+    def untrained(self) -> bool:
+        """Whether the virtual drive as it is makes the estimates."""
+        return self.recipe == UNTRAINED
 
 
 class ReportSettings(Settings):
@@ -183,11 +205,11 @@ class RunSettings(Settings):
         if isinstance(self.sensor, str) and self.sensor not in SENSORS:
             known = ", ".join(SENSORS)
             raise ValueError(f"has the sensor {self.sensor!r}: known are {known}; or its fields")
-        physics = self.model.recipe == "physics"
-        if not (self.simulate or self.drives or self.model.use or physics):
+        untrained = self.model.untrained
+        if not (self.simulate or self.drives or self.model.use or untrained):
             raise ValueError("has nothing to learn from: give drives, simulate, or model.use")
-        if physics and (self.observe is None or self.model.use):
-            raise ValueError("has model.recipe physics, which needs observe and no model.use")
+        if untrained and (self.observe is None or self.model.use):
+            raise ValueError(f"has model.recipe {UNTRAINED}, which needs observe and no model.use")
         if not (self.simulate or self.drives or self.routes or self.map.sources):
             raise ValueError("has no routes: give files of routes, or drives")
         return self
@@ -239,7 +261,7 @@ def read_settings(path: str | os.PathLike[str], changes: Sequence[str] = ()) -> 
 
 
 def _apply(values: dict[str, object], change: str) -> None:
-    """Set one value; levels that are not there are made, and judged with the rest."""
+    """Set one value; levels that are not there are made, and checked with the rest."""
     key, equals, text = change.partition("=")
     if not equals or not key:
         raise UsageError(f"{change!r}: give key=value, e.g. label.matcher=default")

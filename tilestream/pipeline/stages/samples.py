@@ -13,7 +13,9 @@ from tilestream.factors import catalogue, observability
 from tilestream.factors.rows import PLACE_COLUMNS
 from tilestream.factors.virtual_drive import averaged_along
 from tilestream.marks import Mark
-from tilestream.model.dataset import Dataset, features_of, join
+from tilestream.model.dataset import Dataset
+from tilestream.model.features import features_of
+from tilestream.model.join import join
 from tilestream.pipeline.engine.outputs import Facts, Made, Stored
 from tilestream.pipeline.engine.stage import stage
 from tilestream.pipeline.stages.label import ERROR_COLUMNS

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tilestream.errors import ModelError, SourceNotFoundError
 from tilestream.model.dataset import Dataset
-from tilestream.model.model_file import load_model, save_model
+from tilestream.model.file import load_model, save_model
 from tilestream.model.training import Model
 from tilestream.model.training import train as trained
 from tilestream.pipeline.engine.outputs import Facts, Made

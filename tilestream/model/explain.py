@@ -1,4 +1,4 @@
-"""Why an estimate is high, in words: what drives the trees there, and what the map is like."""
+"""Why an estimate is high, in words: what raises it there, and what the map is like."""
 
 import math
 from collections.abc import Hashable, Mapping, Sequence
@@ -8,7 +8,6 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 from scipy.stats import rankdata
-from sklearn.ensemble import RandomForestRegressor
 
 from tilestream.model.phrases import (
     ACROSS,
@@ -74,7 +73,7 @@ class Typical:
     """What factors are at the training places, and on which side of that errors are larger."""
 
     names: tuple[str, ...]
-    """All factors of the dataset, also those that the trees do not ask for."""
+    """All factors of the dataset, also those that the regressor does not read."""
     units: tuple[str, ...]
     """Their units (`Column.unit`)."""
     middle: Float64
@@ -126,29 +125,6 @@ def typical_of(X: Float64, error: Float64, columns: Sequence[Column], pieces: in
     )
 
 
-def contributions(forest: RandomForestRegressor, X: Float64) -> Float64:
-    """(n, f) what each factor adds to each estimate along the paths through the trees.
-
-    On the way from root to leaf, a step changes the mean of the labels at hand; the change belongs
-    to the factor that was asked there (Saabas 2014). The sum over the factors, plus the mean over
-    the roots, is the estimate in the trees' own unit.
-    """
-    total = np.zeros(X.shape)
-    X32 = np.ascontiguousarray(X, np.float32)
-    for estimator in forest.estimators_:
-        tree = estimator.tree_
-        value = tree.value[:, 0, 0]
-        inner = np.flatnonzero(tree.children_left >= 0)
-        change, factor = np.zeros(tree.node_count), np.zeros(tree.node_count, np.int64)
-        for child in (tree.children_left[inner], tree.children_right[inner]):
-            change[child], factor[child] = value[child] - value[inner], tree.feature[inner]
-        paths = tree.decision_path(X32)
-        row = np.repeat(np.arange(len(X)), np.diff(paths.indptr))
-        place = row * X.shape[1] + factor[paths.indices]
-        total += np.bincount(place, change[paths.indices], X.size).reshape(X.shape)
-    return total / len(forest.estimators_)
-
-
 def in_words(
     contribution: Float64, names: Sequence[str], values: Float64, typical: Typical
 ) -> list[str]:
@@ -156,10 +132,10 @@ def in_words(
 
     1. What raises the estimate most and does not sound reassuring (`REASSURING`). Where there is a
        virtual drive it is what that does there.
-    2. What else that the trees ask for raises it most, but for the virtual drive: what a scan would
-       see there.
+    2. What else that the regressor reads raises it most, but for the virtual drive: what a scan
+       would see there.
     3. What of the map's own factors lies farthest out, times how clearly errors go with it (those
-       with which they do not go clearly are left out). The trees need not ask for it.
+       with which they do not go clearly are left out). The regressor need not read it.
 
     A cause, 2 or 3, lies beyond the training quartile, on the side that goes with larger errors and
     noticeably away from the median, and sounds like one. Factors that say the same (the counts are
@@ -167,7 +143,7 @@ def in_words(
     with the factor that weighs most in it, its value there and the median of the training places.
 
     Args:
-        contribution: (n, k) what each factor of the trees adds (`contributions`).
+        contribution: (n, k) what each factor adds (`Regressor.contributions`).
         names: (k,) those factors, each of them in `typical`.
         values: (n, f) the factors of `typical`; NaN where the table has none.
         typical: of the training places.
