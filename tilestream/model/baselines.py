@@ -4,7 +4,7 @@ import warnings
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import pandas as pd
@@ -21,7 +21,7 @@ from threadpoolctl import threadpool_limits
 from tilestream.errors import ModelError
 from tilestream.model.dataset import Dataset, matrix
 from tilestream.model.forest import PaperForest
-from tilestream.model.regressor import Estimator
+from tilestream.model.regressor import Estimator, Kind
 from tilestream.records import Column, Float64
 
 CM_PER_M = 100.0
@@ -44,7 +44,7 @@ horizontal normals alone; only a high wall counts more often than a low one, a c
 class Regression(Estimator):
     """A scikit-learn regressor behind a scaler, on labels in centimetres."""
 
-    kind = "the paper's other models"
+    kind: ClassVar[Kind] = "the paper's other models"
 
     factors: tuple[str, ...]
     """What it was fitted on."""
@@ -127,6 +127,7 @@ class Median(Estimator):
     kind = "opponents"
 
     median: float
+    """Of the training labels."""
 
     @classmethod
     def fit(cls, dataset: Dataset, target: str, seed: int = 0) -> Self:  # noqa: ARG003
@@ -219,7 +220,12 @@ class FootprintForest(PaperForest):
         return [column for column in columns if column.name in FOOTPRINT]
 
 
-PAPERS_OTHERS = (PrincipalComponents, Perceptron, SupportVectors, GradientDescent)
+PAPERS_OTHERS: tuple[type[Estimator], ...] = (
+    PrincipalComponents,
+    Perceptron,
+    SupportVectors,
+    GradientDescent,
+)
 """What the paper compares with; scikit-learn's defaults."""
-OPPONENTS = (Median, PathMedian, Nearest, FootprintForest)
+OPPONENTS: tuple[type[Estimator], ...] = (Median, PathMedian, Nearest, FootprintForest)
 """What any claim must beat."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import pandas as pd
@@ -10,7 +10,7 @@ from sklearn.ensemble import RandomForestRegressor
 
 from tilestream.errors import ModelError
 from tilestream.model.dataset import LEAST, LENGTHS, Dataset, matrix
-from tilestream.model.regressor import Regressor
+from tilestream.model.regressor import Kind, Regressor
 from tilestream.model.splits import Split, block_splits
 from tilestream.records import Column, Float64
 
@@ -48,7 +48,7 @@ class Forest(Regressor):
     structure of trees does: no method gives the values of inner nodes.
     """
 
-    kind = "ours"
+    kind: ClassVar[Kind] = "ours"
     types = frozenset(
         {
             "sklearn.ensemble._forest.RandomForestRegressor",

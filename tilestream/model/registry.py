@@ -16,7 +16,6 @@ UNTRAINED = Physics.name
 """The one that needs no training: the virtual drive as it is."""
 RECIPES = (*REGRESSORS, UNTRAINED)
 """What `model.recipe` may be."""
-COMPETITORS: dict[str, type[Estimator]] = {
-    one.name: one for one in (*REGRESSORS.values(), *PAPERS_OTHERS, *OPPONENTS, Physics)
-}
+_ALL: tuple[type[Estimator], ...] = (*REGRESSORS.values(), *PAPERS_OTHERS, *OPPONENTS, Physics)
+COMPETITORS = {one.name: one for one in _ALL}
 """All that evaluations compare, in the order of their tables."""
