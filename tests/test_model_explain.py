@@ -146,7 +146,7 @@ def test_the_worst_places_name_a_cause_in_the_map() -> None:
     with pytest.MonkeyPatch.context() as patch:
         growth = asdict(Growth(trees=10, leaf=8, log=True))
         patch.setattr(DefaultForest, "tuned", lambda *_: growth)
-        model = train(learnt)
+        model = train(learnt, recipe="default")
     typical = model.typical
     assert model.factors == ("vd_mean", "ob_info_along")
     found = predict(model, factors)

@@ -23,7 +23,7 @@ from tilestream.model import forest
 from tilestream.model.dataset import TARGETS, Dataset, made_with
 from tilestream.model.domain import domain_of
 from tilestream.model.file import load_model, save_model
-from tilestream.model.forest import Growth
+from tilestream.model.forest import Growth, PaperForest
 from tilestream.model.join import join
 from tilestream.model.training import PREDICTION_COLUMNS, Model, predict, train
 from tilestream.sensor import HDL64, VLP16
@@ -165,8 +165,8 @@ def test_a_model_is_one_file(model: Model, places: pd.DataFrame, tmp_path: Path)
     assert [p.name for p in path.parent.iterdir()] == ["model.skops"]
     with zipfile.ZipFile(path) as archive:
         types = set(model_file._types(json.loads(archive.read("schema.json"))))
-    assert types == model_file.TYPES
-    assert set(skops.io.get_untrusted_types(file=path)) <= {"sklearn.tree._tree.Tree"}
+    assert types == model_file.CONTAINERS | PaperForest.types
+    assert set(skops.io.get_untrusted_types(file=path)) <= PaperForest.types
 
 
 def altered(path: Path, facts: dict[str, Any]) -> None:
@@ -269,8 +269,7 @@ def test_bad_training_is_refused(learnt: Dataset) -> None:
 def test_the_default_model_is_tuned_and_calibrated() -> None:
     factors, labels = drives(9, {"a": 210, "b": 210}, related=0.9)
     found = join(factors, {"drive": labels}, COLUMNS[:4])
-    made = train(found, n_jobs=1)
-    assert made.facts["recipe"] == "default"
+    made = train(found, recipe="default")
     assert made.facts["log"]
     assert made.interval.blocks == 2
     assert made.interval.level == 0.9

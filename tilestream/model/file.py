@@ -29,16 +29,17 @@ from tilestream.version import VERSION
 FORMAT = "tilestream model"
 FORMAT_VERSION = 2
 """Raise it when a model of an older file would be read wrongly."""
-TYPES = frozenset(
+CONTAINERS = frozenset(
     {
         "builtins.dict",
         "builtins.list",
         "builtins.str",
         "builtins.tuple",
         "numpy.ndarray",
-        *(name for regressor in REGRESSORS.values() for name in regressor.types),
     }
 )
+"""What every model file is built of."""
+TYPES = CONTAINERS.union(*(regressor.types for regressor in REGRESSORS.values()))
 """Every type that a model file may name."""
 TYPICAL = ("middle", "below", "above", "rho")
 """The arrays of `Typical`, one number per factor."""
