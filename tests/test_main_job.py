@@ -10,7 +10,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +38,7 @@ from tilestream.factors.virtual_scan import VirtualSettings
 from tilestream.model import evaluation, forest, registry, training
 from tilestream.model.dataset import TARGETS
 from tilestream.model.file import load_model, save_model
-from tilestream.model.forest import Growth
+from tilestream.model.forest import Growth, PaperForest
 from tilestream.model.intervals import coverage
 from tilestream.model.training import PREDICTION_COLUMNS
 from tilestream.pipeline.engine.attempt import Outcome
@@ -97,7 +97,7 @@ def small_forests(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        patch.setattr(forest, "PAPER", Growth(trees=5))
+        patch.setattr(PaperForest, "defaults", asdict(Growth(trees=5)))
         patch.setattr(forest, "CANDIDATES", (Growth(trees=4, leaf=2, log=True),))
         patch.delitem(registry.COMPETITORS, "mlp")  # a thousand passes over the data
         patch.setattr(pictures.png, "__defaults__", (20,))

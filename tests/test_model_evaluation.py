@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from model_data import COLUMNS, caused, dataset, drives, unrelated
 
 from tilestream.errors import ModelError
-from tilestream.model import forest
 from tilestream.model.evaluation import (
     PAPER_TABLE,
     Figures,
@@ -36,7 +35,7 @@ QUICK = Growth(trees=20)
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> str:
     """The name of the paper's forest, which has a fifth of its trees."""
-    monkeypatch.setattr(forest, "PAPER", QUICK)
+    monkeypatch.setattr(PaperForest, "defaults", asdict(QUICK))
     return PaperForest.name
 
 

@@ -3,7 +3,7 @@
 import io
 import json
 import zipfile
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,6 @@ from sklearn.linear_model import LinearRegression
 
 from tilestream.errors import ModelError, SourceNotFoundError, UsageError
 from tilestream.model import file as model_file
-from tilestream.model import forest
 from tilestream.model.dataset import TARGETS, Dataset, made_with
 from tilestream.model.domain import domain_of
 from tilestream.model.file import load_model, save_model
@@ -42,7 +41,7 @@ def learnt() -> Dataset:
 @pytest.fixture(scope="module")
 def model(learnt: Dataset) -> Model:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(forest, "PAPER", Growth(trees=15))
+        patch.setattr(PaperForest, "defaults", asdict(Growth(trees=15)))
         return train(learnt, recipe="paper")
 
 
@@ -76,7 +75,7 @@ def test_a_place_has_the_same_bits_in_any_company(
 
 
 def test_the_same_model_from_rows_in_any_order(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(forest, "PAPER", Growth(trees=5))
+    monkeypatch.setattr(PaperForest, "defaults", asdict(Growth(trees=5)))
     factors, labels = drives(4, {"a": 150, "b": 220})
     mixed = factors.sample(frac=1.0, random_state=0), labels.sample(frac=1.0, random_state=1)
     one, two = (
@@ -183,6 +182,10 @@ def altered(path: Path, facts: dict[str, Any]) -> None:
         ({"sklearn": "0.24.2"}, f"scikit-learn 0.24.2, here is {sklearn.__version__}"),
         ({"format": "other"}, "no model of tilestream"),
         ({"factors": ["one"]}, "its forest is not of its factors"),
+        (
+            {"facts": {"recipe": "best"}},
+            "a model of 'best', and this tilestream has default, paper",
+        ),
         ({"interval": None}, "a damaged model file"),
         ({"typical": {"names": ["FDOP"], "units": ["1"]}}, "what is typical is not of its factors"),
     ],
@@ -251,7 +254,7 @@ def test_a_tree_that_leads_out_of_its_arrays_is_refused(model: Model, tmp_path: 
 def test_training_on_a_short_drive_says_that_nothing_was_calibrated(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(forest, "PAPER", Growth(trees=5))
+    monkeypatch.setattr(PaperForest, "defaults", asdict(Growth(trees=5)))
     short = train(dataset(0, lengths={"a": 80}), recipe="paper")
     found = predict(short, drives(1, {"b": 50})[0])
     assert short.interval.blocks == 0

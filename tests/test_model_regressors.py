@@ -16,7 +16,7 @@ from tilestream.model.baselines import FOOTPRINT
 from tilestream.model.dataset import Dataset
 from tilestream.model.evaluation import figures_of, held_out
 from tilestream.model.features import with_derived
-from tilestream.model.forest import CANDIDATES, CAUTIOUS, PAPER, DefaultForest, Growth, PaperForest
+from tilestream.model.forest import CANDIDATES, CAUTIOUS, DefaultForest, Growth, PaperForest
 from tilestream.model.join import join
 from tilestream.model.registry import COMPETITORS, REGRESSORS
 from tilestream.model.splits import Split, leave_path_out
@@ -93,7 +93,7 @@ def test_the_papers_forest_is_scikit_learns_own(caused: Dataset) -> None:
     plain = RandomForestRegressor(random_state=3).fit(caused.matrix(), caused.label())
     ours = PaperForest.fit(caused, "error_mean", seed=3)
     assert np.array_equal(ours.predict(caused.rows), plain.predict(caused.matrix()))
-    assert PAPER.trees == 100
+    assert PaperForest.defaults["trees"] == 100
 
 
 def test_the_forest_is_chosen_on_held_out_blocks(caused: Dataset) -> None:

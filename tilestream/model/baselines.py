@@ -1,14 +1,14 @@
 """What evaluations compare with: the paper's other models, and opponents that know no factors."""
 
 import warnings
-from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 import pandas as pd
 from scipy.spatial import cKDTree
+from sklearn.base import BaseEstimator, clone
 from sklearn.decomposition import PCA
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.linear_model import LinearRegression, SGDRegressor
@@ -45,21 +45,20 @@ class Regression(Estimator):
     """A scikit-learn regressor behind a scaler, on labels in centimetres."""
 
     kind: ClassVar[Kind] = "the paper's other models"
+    steps: ClassVar[tuple[BaseEstimator, ...]]
+    """What follows the scaler: scikit-learn's defaults wherever nothing is said."""
 
     factors: tuple[str, ...]
     """What it was fitted on."""
     pipeline: Pipeline
     """Scaler and regressor, fitted."""
 
-    @staticmethod
-    @abstractmethod
-    def steps(seed: int) -> list[Any]:
-        """What follows the scaler: scikit-learn's defaults wherever nothing is said."""
-
     @classmethod
     def fit(cls, dataset: Dataset, target: str, seed: int = 0) -> Self:
         """As `Estimator.fit`, on all factors."""
-        pipeline = make_pipeline(StandardScaler(), *cls.steps(seed))
+        pipeline = clone(make_pipeline(StandardScaler(), *cls.steps))
+        seeds = [name for name in pipeline.get_params() if name.endswith("__random_state")]
+        pipeline.set_params(**dict.fromkeys(seeds, seed))
         # How many threads share a product shows in the perceptron's last bits.
         with threadpool_limits(1, "blas"), warnings.catch_warnings():
             # Whether the paper's perceptron has converged shows in its figures.
@@ -79,10 +78,7 @@ class PrincipalComponents(Regression):
 
     name = "pcr"
     words = "principal component regression"
-
-    @staticmethod
-    def steps(seed: int) -> list[Any]:  # noqa: ARG004, D102
-        return [PCA(n_components=0.95), LinearRegression()]
+    steps = PCA(n_components=0.95), LinearRegression()
 
 
 class Perceptron(Regression):
@@ -90,10 +86,7 @@ class Perceptron(Regression):
 
     name = "mlp"
     words = "multi-layer perceptron"
-
-    @staticmethod
-    def steps(seed: int) -> list[Any]:  # noqa: D102
-        return [MLPRegressor(max_iter=1000, tol=1e-3, random_state=seed)]
+    steps = (MLPRegressor(max_iter=1000, tol=1e-3),)
 
 
 class SupportVectors(Regression):
@@ -101,10 +94,7 @@ class SupportVectors(Regression):
 
     name = "svr"
     words = "support vector regression"
-
-    @staticmethod
-    def steps(seed: int) -> list[Any]:  # noqa: ARG004, D102
-        return [SVR()]
+    steps = (SVR(),)
 
 
 class GradientDescent(Regression):
@@ -112,10 +102,7 @@ class GradientDescent(Regression):
 
     name = "sgd"
     words = "linear, stochastic gradient descent"
-
-    @staticmethod
-    def steps(seed: int) -> list[Any]:  # noqa: D102
-        return [SGDRegressor(random_state=seed)]
+    steps = (SGDRegressor(),)
 
 
 @dataclass(frozen=True, eq=False)

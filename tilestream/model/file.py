@@ -70,7 +70,7 @@ def save_model(model: Model, path: str | os.PathLike[str]) -> None:
         "worst": model.worst,
         "facts": dict(model.facts),
     }
-    content = {
+    content = {  # "forests" is what version 0.1 calls the regressors
         "facts": json.dumps(facts, sort_keys=True),
         "forests": {target: one.save() for target, one in model.regressors.items()},
         "domain": {

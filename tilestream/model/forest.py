@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -10,8 +11,8 @@ from sklearn.ensemble import RandomForestRegressor
 
 from tilestream.errors import ModelError
 from tilestream.model.dataset import LEAST, LENGTHS, Dataset, matrix
-from tilestream.model.regressor import Kind, Regressor
-from tilestream.model.splits import Split, block_splits
+from tilestream.model.regressor import Kind, Regressor, held_out_estimates
+from tilestream.model.splits import block_splits
 from tilestream.records import Column, Float64
 
 
@@ -30,8 +31,6 @@ class Growth:
     instead of the mean, which a few lost places pull up."""
 
 
-PAPER = Growth()
-"""scikit-learn's defaults: the paper's forest."""
 CAUTIOUS = Growth(leaf=8, share=1.0 / 3.0, log=True)
 """The default forest where there are no blocks to choose on."""
 CANDIDATES = (Growth(leaf=2, log=True), CAUTIOUS, replace(CAUTIOUS, leaf=32))
@@ -172,21 +171,11 @@ def _ends(tree: Any, factors: int) -> bool:
 
 
 class PaperForest(Forest):
-    """The forest as the paper grows it."""
+    """The forest as the paper grows it: scikit-learn's defaults."""
 
     name = "paper"
     words = "forest, the paper's setting"
-
-    @classmethod
-    def tuned(
-        cls,
-        dataset: Dataset,  # noqa: ARG003
-        target: str,  # noqa: ARG003
-        seed: int = 0,  # noqa: ARG003
-        n_jobs: int | None = 1,  # noqa: ARG003
-    ) -> Mapping[str, Any]:
-        """The same for every dataset."""
-        return asdict(PAPER)
+    defaults = asdict(Growth())
 
 
 class DefaultForest(Forest):
@@ -194,6 +183,7 @@ class DefaultForest(Forest):
 
     name = "default"
     words = "forest, tuned on held-out blocks"
+    defaults = asdict(CAUTIOUS)
 
     @classmethod
     def features(cls, columns: Sequence[Column]) -> Sequence[Column]:
@@ -214,27 +204,12 @@ class DefaultForest(Forest):
         try:
             splits = block_splits(dataset, folds=3)
         except ModelError:
-            return asdict(CAUTIOUS)
-        errors = [
-            cls._held_out_error(dataset, splits, target, one, seed, n_jobs) for one in CANDIDATES
-        ]
-        return asdict(CANDIDATES[int(np.argmin(errors))])
-
-    @classmethod
-    def _held_out_error(
-        cls,
-        dataset: Dataset,
-        splits: list[Split],
-        target: str,
-        growth: Growth,
-        seed: int,
-        n_jobs: int | None,
-    ) -> float:
-        """Mean absolute error on the held-out rows [m], with half the trees: ranks are the same."""
-        quick = asdict(replace(growth, trees=growth.trees // 2))
+            return cls.defaults
+        rows = np.concatenate([split.test for split in splits])
         errors = []
-        for split in splits:
-            forest = cls.fit(dataset.take(split.train), target, seed, quick, n_jobs)
-            test = dataset.take(split.test)
-            errors.append(np.abs(forest.predict(test.rows) - test.label(target)))
-        return float(np.concatenate(errors).mean())
+        for growth in CANDIDATES:
+            quick = asdict(replace(growth, trees=growth.trees // 2))  # the ranks are the same
+            fit = partial(cls.fit, target=target, seed=seed, settings=quick, n_jobs=n_jobs)
+            off = held_out_estimates(dataset, splits, fit) - dataset.label(target)
+            errors.append(np.abs(off[rows]).mean())
+        return asdict(CANDIDATES[int(np.argmin(errors))])

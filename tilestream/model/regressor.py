@@ -5,12 +5,14 @@ its estimates and is kept in a file. `registry.py` lists them all.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, Literal, Self
 
+import numpy as np
 import pandas as pd
 
 from tilestream.model.dataset import Dataset
+from tilestream.model.splits import Split
 from tilestream.records import Column, Float64
 
 Kind = Literal["ours", "the paper's other models", "opponents"]
@@ -60,6 +62,9 @@ class Regressor(Estimator):
     types: ClassVar[frozenset[str]]
     """Every type beyond NumPy's arrays that skops may build to read one, `module.Name`."""
 
+    defaults: ClassVar[Mapping[str, Any]]
+    """The settings to fit with where none are tuned: plain values of JSON by name."""
+
     factors: tuple[str, ...]
     """What it was fitted on, in this order."""
     settings: Mapping[str, Any]
@@ -71,11 +76,14 @@ class Regressor(Estimator):
         return columns
 
     @classmethod
-    @abstractmethod
     def tuned(
-        cls, dataset: Dataset, target: str, seed: int = 0, n_jobs: int | None = 1
+        cls,
+        dataset: Dataset,  # noqa: ARG003
+        target: str,  # noqa: ARG003
+        seed: int = 0,  # noqa: ARG003
+        n_jobs: int | None = 1,  # noqa: ARG003
     ) -> Mapping[str, Any]:
-        """The settings to fit with, chosen on this dataset alone: plain values of JSON by name.
+        """The settings to fit with, chosen on this dataset alone; `defaults` unless it chooses.
 
         The facts of a model hold them beside its `seed`, `points`, `paths` and so on.
 
@@ -85,6 +93,7 @@ class Regressor(Estimator):
             seed: of the random numbers.
             n_jobs: threads or processes; None: what joblib's context says (Dask).
         """
+        return cls.defaults
 
     @classmethod
     @abstractmethod
@@ -116,7 +125,9 @@ class Regressor(Estimator):
 
     @abstractmethod
     def importances(self) -> Float64:
-        """(f,) how much each of `factors` matters in all; at least 0, their sum is 1."""
+        """(f,) how much each of `factors` matters in all; at least 0, their sum is 1, or 0 where
+        nothing was learnt.
+        """
 
     @abstractmethod
     def save(self) -> Any:
@@ -138,3 +149,20 @@ class Regressor(Estimator):
         Raises:
             ModelError: it is damaged: estimating with it could fail or read foreign memory.
         """
+
+
+def held_out_estimates(
+    dataset: Dataset, splits: Sequence[Split], fit: Callable[[Dataset], Estimator]
+) -> Float64:
+    """(n,) each row of a dataset as estimated without it; NaN where no split holds it out.
+
+    Args:
+        dataset: n labelled places.
+        splits: what is held out, and what trains.
+        fit: what is fitted on the training rows of a split.
+    """
+    estimate = np.full(len(dataset), np.nan)
+    for split in splits:
+        fitted = fit(dataset.take(split.train))
+        estimate[split.test] = fitted.predict(dataset.take(split.test).rows)
+    return estimate

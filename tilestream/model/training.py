@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from tilestream.model.explain import PIECE, Typical, compared, in_words, typical
 from tilestream.model.features import with_derived
 from tilestream.model.intervals import LEVEL, NOT_CALIBRATED, Interval, calibrate
 from tilestream.model.registry import DEFAULT, REGRESSORS
-from tilestream.model.regressor import Regressor
+from tilestream.model.regressor import Regressor, held_out_estimates
 from tilestream.model.splits import block_splits
 from tilestream.records import Column, Float64
 
@@ -164,10 +165,8 @@ def _interval(
         splits = block_splits(dataset)
     except ModelError:
         return NOT_CALIBRATED
-    estimate = np.empty(len(dataset))
-    for split in splits:
-        fitted = regressor.fit(dataset.take(split.train), MAIN, seed, settings, n_jobs)
-        estimate[split.test] = fitted.predict(dataset.take(split.test).rows)
+    fit = partial(regressor.fit, target=MAIN, seed=seed, settings=settings, n_jobs=n_jobs)
+    estimate = held_out_estimates(dataset, splits, fit)
     blocks = dataset.rows["block"].to_numpy(str)
     return calibrate(dataset.label(MAIN), estimate, blocks, LEVEL)
 
