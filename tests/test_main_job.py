@@ -337,10 +337,10 @@ def test_a_task_that_fails_keeps_nothing_else_from_its_end(
     assert places.loc["tunnel", "estimate"].isna().all()
     assert places.loc["tunnel", "reason"].str.contains("task failed").all()
     assert places.loc[["canyon", "crossing"], "estimate"].notna().all()
-    the_recipe_in_use_is_judged(copy, "paper")
+    the_recipe_in_use_is_evaluated(copy, "paper")
 
 
-def the_recipe_in_use_is_judged(folder: Path, recipe: str) -> None:
+def the_recipe_in_use_is_evaluated(folder: Path, recipe: str) -> None:
     """Held-out lines, intervals, parts and the verdict are of the model that made the estimates."""
     report = json.loads((folder / "report" / "report.json").read_text())
     assert report["model"] == recipe
@@ -587,6 +587,7 @@ LEARNING = "out: run\nmap: {sources: [a.pcd]}\nroutes: [r.csv]\nsimulate: {}\n"
         (JOB + "simulate: {prset: paper}", r"simulate: prset is no .*did you mean preset"),
         (LEARNING + "observe: {range_mx: 3}", r"observe: range_mx is no .*did you mean range_max"),
         (LEARNING + "model: {recip: paper}", r"model: recip is no .*did you mean recipe"),
+        (LEARNING + "model: {recipe: best}", r"recipe is 'best': choose from paper, .*physics"),
         (LEARNING + "report: {treshold: 1}", r"report: treshold is no .*did you mean threshold"),
         (LEARNING + "label: {matcher: {solvr: raw}}", r"matcher.*: solvr is no .*mean solver"),
         (LEARNING + "label: {matcher: {solver: best}}", r"matcher.*: solver is 'best'.* or 'raw'"),

@@ -1,4 +1,4 @@
-"""Is this place like the training places? A forest answers either way, so something must ask."""
+"""Is a place like the training places? A regressor gives an estimate either way."""
 
 from dataclasses import dataclass
 

@@ -32,7 +32,8 @@ IN_MAP_AXES: dict[str, Column | None] = {
     "score_cov_yy": SPREAD_ACROSS,
     "score_cov_xy": None,
 }
-"""Directions in the map name a street as its position does: these take their place."""
+"""Directions in the map identify a street as its position does. By name: what replaces each of
+them, relative to the direction of travel; None: nothing."""
 
 
 def features_of(columns: Sequence[Column]) -> tuple[Column, ...]:
@@ -43,7 +44,10 @@ def features_of(columns: Sequence[Column]) -> tuple[Column, ...]:
 
 
 def with_derived(factors: pd.DataFrame) -> pd.DataFrame:
-    """A factor table with what is in map axes turned into the route's, by its `heading`."""
+    """A factor table with the columns that replace those in map axes (`IN_MAP_AXES`).
+
+    They follow from `heading` [rad, map frame]; a table without it is given back as it is.
+    """
     if "heading" not in factors:
         return factors
     heading = factors["heading"].to_numpy(np.float64)

@@ -34,17 +34,17 @@ class Growth:
 CAUTIOUS = Growth(leaf=8, share=1.0 / 3.0, log=True)
 """The default forest where there are no blocks to choose on."""
 CANDIDATES = (Growth(leaf=2, log=True), CAUTIOUS, replace(CAUTIOUS, leaf=32))
-"""Forests among which the default is chosen: for factors that tell much, some, or little."""
+"""Forests among which the default is chosen: for factors that explain much, some, or little."""
 
 
 @dataclass(frozen=True, eq=False)
 class Forest(Regressor):
     """A random forest that has been grown.
 
-    scikit-learn's own `predict` of a forest costs more than the answers for the places of a tile,
-    so its trees are asked one after the other, in the order in which it adds them up. Contributions
-    and the check of a file read the arrays of each `tree_`, as scikit-learn's guide to the
-    structure of trees does: no method gives the values of inner nodes.
+    For the few places of a tile `predict` of scikit-learn's forest takes three times as long as
+    those of its trees, so these are called one after the other and summed in the same order.
+    Contributions and the check of a file read the arrays of each `tree_`, as scikit-learn's guide
+    to the structure of trees does: no method gives the values of inner nodes.
     """
 
     kind: ClassVar[Kind] = "ours"
@@ -62,7 +62,7 @@ class Forest(Regressor):
     trees: RandomForestRegressor
     """scikit-learn's forest."""
     log: bool
-    """Whether its trees speak of logarithms."""
+    """Whether its trees estimate logarithms."""
 
     @classmethod
     def fit(
@@ -104,8 +104,8 @@ class Forest(Regressor):
         """(n, f) what each factor adds along the paths through the trees.
 
         On the way from root to leaf, a step changes the mean of the labels at hand; the change
-        belongs to the factor that was asked there (Saabas 2014). The sum over the factors, plus the
-        mean over the roots, is the estimate in the trees' own unit.
+        belongs to the factor that the node compares (Saabas 2014). The sum over the factors, plus
+        the mean over the roots, is the estimate in the trees' own unit.
         """
         X32 = self._inputs(places)
         total = np.zeros(X32.shape)
@@ -154,7 +154,7 @@ def _of_logarithms(log: bool, target: str) -> bool:
 
 
 def _ends(tree: Any, factors: int) -> bool:
-    """Whether every path through a tree ends, and asks for factors that are there."""
+    """Whether every path through a tree ends, and compares only factors that exist."""
     nodes = np.arange(tree.node_count)
     left, right = tree.children_left, tree.children_right
     inner = left >= 0
@@ -187,8 +187,8 @@ class DefaultForest(Forest):
 
     @classmethod
     def features(cls, columns: Sequence[Column]) -> Sequence[Column]:
-        """Observability alone where it is there, since all others mostly tell one street from
-        another, which is of no use on a street never driven (benchmarks/RESULTS.md); else all.
+        """Observability alone where the dataset has it, else all: the others mostly identify a
+        street, which is of no use on a street never driven (benchmarks/RESULTS.md).
         """
         return [c for c in columns if c.factor_set == "observability"] or columns
 

@@ -14,7 +14,7 @@ from tilestream.model.features import features_of, with_derived
 from tilestream.records import Column, Float64, Int64
 
 PLACE = ("route_id", "arc_length", "x", "y", "z", "heading")
-"""Where a row is: never a feature."""
+"""Columns that say where a row is; never features."""
 TOLERANCE = 0.5
 """How far a scan may be from the sample point whose factors it gets [m]: half the spacing."""
 BLOCK = 200.0
@@ -117,7 +117,7 @@ def _blocks(table: pd.DataFrame, block: float) -> list[str]:
 def _joined(
     places: pd.DataFrame, group: str, labels: pd.DataFrame, tolerance: float
 ) -> pd.DataFrame:
-    """The labels of one group with the columns of their place, and why a row is no pair."""
+    """The labels of one group with the columns of their place, and why a row cannot be joined."""
     _require(labels, _LABELLED, f"group {group!r}")
     if labels["sample"].duplicated().any():
         sample = labels.loc[labels["sample"].duplicated(), "sample"].iloc[0]

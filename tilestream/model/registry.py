@@ -11,7 +11,7 @@ from tilestream.model.regressor import Estimator, Regressor
 REGRESSORS: dict[str, type[Regressor]] = {one.name: one for one in (PaperForest, DefaultForest)}
 """Those that are trained and kept in a file."""
 DEFAULT = DefaultForest.name
-"""The one that a job trains unless told otherwise."""
+"""The one that a job trains unless `model.recipe` says otherwise."""
 UNTRAINED = Physics.name
 """The one that needs no training: the virtual drive as it is."""
 RECIPES = (*REGRESSORS, UNTRAINED)

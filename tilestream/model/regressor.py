@@ -105,15 +105,8 @@ class Regressor(Estimator):
         settings: Mapping[str, Any] | None = None,
         n_jobs: int | None = 1,
     ) -> Self:
-        """As `Estimator.fit`.
-
-        Args:
-            dataset: labelled places.
-            target: which label.
-            seed: of the random numbers.
-            settings: as `tuned` gives them; None: it chooses them on this dataset.
-            n_jobs: threads or processes; None: what joblib's context says (Dask). The bits are
-                the same.
+        """As `Estimator.fit`, with `settings` as `tuned` gives them (None: it chooses them on this
+        dataset) and `n_jobs` as there; the bits are the same for any.
         """
 
     @abstractmethod

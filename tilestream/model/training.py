@@ -158,8 +158,8 @@ def _interval(
     """The interval, from estimates of blocks that the regressor has not seen.
 
     The settings were chosen on these blocks too, so the interval is a little narrower than one
-    whose settings had been chosen anew for each fold: which of a few candidates is best on all
-    blocks is all that a held-out block has told.
+    whose settings had been chosen anew for each fold. The effect is small: a held-out block only
+    had a part in choosing one of a few candidates.
     """
     try:
         splits = block_splits(dataset)
@@ -273,7 +273,7 @@ def check_making(model: Model, made_with: Mapping[str, Any]) -> None:
 
 
 def _short(values: Mapping[str, Any], names: Sequence[str]) -> str:
-    """Some of the values; of lists their length."""
+    """The values of these names as text; of lists their length."""
     said = {k: values.get(k) for k in ("name", *names) if k in values}
     short = {k: f"{len(v)} values" if isinstance(v, list | tuple) else v for k, v in said.items()}
     return ", ".join(f"{name} {value}" for name, value in short.items())
@@ -287,7 +287,9 @@ def _reasons(
     good: NDArray[np.bool_],
     in_domain: NDArray[np.bool_],
 ) -> list[str]:
-    """For the worst places, the strange ones, and those without an estimate."""
+    """(n,) words for the worst places, those outside the domain and those without an estimate; else
+    empty.
+    """
     words = np.full(len(X), "", dtype=object)
     worst = np.flatnonzero(good & (estimate > model.worst))
     if worst.size:

@@ -28,7 +28,8 @@ BYTES_PER_ROW = 10_000
 """Memory per sample point of a joined table: a thousand numbers in several copies."""
 
 MAY_BE_NAN = ("ob_cov_along", "ob_cov_across", "ob_cov_up", "ob_cov_yaw", "vd_median")
-"""What observability has no number for at a place that is lost: the others tell how lost it is."""
+"""Columns of observability that are NaN at some places that have all others; no features, since a
+NaN among the features would leave such a place without an estimate."""
 COLUMNS = (
     *catalogue.COLUMNS,
     *(column for column in observability.COLUMNS if column.name not in MAY_BE_NAN),
