@@ -30,7 +30,7 @@ from shinjuku_labels import LIMITS, PAPER
 
 import tilestream as ts
 from tilestream.model.evaluation import PAPER_TABLE
-from tilestream.model.protocols import PROTOCOLS
+from tilestream.model.splits import PROTOCOLS
 
 CM = 100.0
 FIRST = 12

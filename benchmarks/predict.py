@@ -3,8 +3,8 @@
     python benchmarks/predict.py [--rows N] [--share S] [--json FILE]
     python benchmarks/predict.py --run DIR [--json FILE]
 
-Without a run: trains both recipes on synthetic drives as long as the paper's five paths, then times
-`predict` on one core: the whole, and its parts.
+Without a run: trains each regressor on synthetic drives as long as the paper's five paths, then
+times `predict` on one core: the whole, and its parts.
 
 With a finished run directory: the whole district's estimate, from its tables of factors to
 GeoParquet, as the main job makes it: the model is loaded once, each tile's tables are read,
@@ -46,11 +46,11 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 import numpy as np
 import pandas as pd
-from forest_data import COLUMNS, LENGTHS, dataset, drives
+from model_data import COLUMNS, LENGTHS, dataset, drives
 
 from tilestream.grid import TileKey
-from tilestream.model.model_file import load_model, save_model
-from tilestream.model.reasons import contributions
+from tilestream.model.file import load_model, save_model
+from tilestream.model.registry import REGRESSORS
 from tilestream.model.training import predict, train
 from tilestream.pipeline.engine.attempt import perform
 from tilestream.pipeline.engine.outputs import Parquet
@@ -78,7 +78,7 @@ def seconds(work: Callable[[], object]) -> float:
 
 
 def measure(recipe: str, rows: int, share: float, file: Path) -> dict[str, float | str]:
-    """Figures of one recipe, trained on the first part of each path."""
+    """Figures of one regressor, trained on the first part of each path."""
     lengths = {path: round(share * metres) for path, metres in LENGTHS.items()}
     begin = time.process_time()
     save_model(train(dataset(0, lengths=lengths), recipe=recipe), file)
@@ -87,16 +87,16 @@ def measure(recipe: str, rows: int, share: float, file: Path) -> dict[str, float
     some = drives(1, {"a": 2000})[0]
     table = pd.concat([some] * -(-rows // len(some)), ignore_index=True).iloc[:rows]
     X = table[[column.name for column in COLUMNS]].to_numpy(np.float64)
-    forest, few = model.forests["error_mean"], X[: rows // 10]
+    regressor, few = model.regressors["error_mean"], table[: rows // 10]
     return {
         "recipe": recipe,
         "train_s": trained,
         "file_mb": file.stat().st_size / 1e6,
         "load_s": seconds(lambda: load_model(file)),
         "predict_rows_per_s": rows / seconds(lambda: predict(model, table)),
-        "error_mean_alone_rows_per_s": rows / seconds(lambda: forest.estimate(X)),
+        "error_mean_alone_rows_per_s": rows / seconds(lambda: regressor.predict(table)),
         "domain_rows_per_s": rows / seconds(lambda: model.domain.distance(X)),
-        "contributions_rows_per_s": len(few) / seconds(lambda: contributions(forest.trees, few)),
+        "contributions_rows_per_s": len(few) / seconds(lambda: regressor.contributions(few)),
     }
 
 
@@ -191,8 +191,7 @@ def main(given: argparse.Namespace) -> None:
     else:
         file = Path(os.environ.get("TMPDIR", "/tmp")) / f"predict-{os.getpid()}.skops"
         try:
-            recipes = ("default", "paper")
-            found = [measure(recipe, given.rows, given.share, file) for recipe in recipes]
+            found = [measure(recipe, given.rows, given.share, file) for recipe in REGRESSORS]
         finally:
             file.unlink(missing_ok=True)
     for figures in found:

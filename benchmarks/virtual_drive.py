@@ -68,8 +68,8 @@ from tilestream.formats.routes import route_of
 from tilestream.grid import MM_PER_M
 from tilestream.kernels.virtual_scan import cast
 from tilestream.pipeline.jobs.along_routes import observe_along
-from tilestream.pipeline.jobs.run_settings import read_settings
-from tilestream.settings import DriveSettings, RunSettings, VirtualSettings
+from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
+from tilestream.settings import DriveSettings, VirtualSettings
 
 BINS = (0.0, 5.0, 10.0, 20.0, 30.0, 50.0, 100.0)
 """Ranges by which scans are compared [m]."""

@@ -9,9 +9,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tilestream.model.models import FORESTS, OPPONENTS
+from tilestream.model.registry import REGRESSORS
 from tilestream.records import Float64
 from tilestream.report import Findings, write_report
+from tilestream.report.evaluation import OPPONENTS
 
 ORIGIN = (368_000.0, 3_950_000.0, 40.0)
 LIMIT = 0.15
@@ -133,7 +134,7 @@ def whole(seed: int = 0) -> Findings:
     """Findings with every part filled in."""
     places = places_of(LENGTHS, seed)
     labels = labels_of(places, ("morning", "noon"))
-    models = [*FORESTS, *OPPONENTS]
+    models = [*REGRESSORS, *OPPONENTS]
     table = pd.concat(
         [
             judged_by(["paper"], ("paper", "path", "blocks")).assign(factors=name)

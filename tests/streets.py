@@ -8,7 +8,7 @@ from logs import SECOND, START, pose
 from scenes import PLACES, in_map
 
 from tilestream.formats.points.pcd import write_pcd
-from tilestream.settings import RunSettings
+from tilestream.pipeline.jobs.run_settings import RunSettings
 
 STREETS = {"canyon": 0.0, "tunnel": 400.0, "crossing": 800.0}
 """Kind of each street, and where it begins [m, map x]."""
@@ -52,5 +52,6 @@ def job(folder: Path, out: Path, **changes: object) -> RunSettings:
         "drives": [{"log": str(folder / f"{kind}.mcap")} for kind in STREETS],
         "observe": None,
         "label": {"matcher": "default", "starts": {"radius": 0.4, "step": 0.2}},
+        "model": {"recipe": "default"},
     }
     return RunSettings(**(values | changes))

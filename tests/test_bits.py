@@ -15,9 +15,9 @@ import numpy as np
 import pandas as pd
 import processors
 import pytest
-from forest_data import dataset
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from model_data import dataset
 from numpy.typing import NDArray
 from scenes import scene
 from threadpoolctl import threadpool_limits
@@ -32,10 +32,10 @@ from tilestream.formats.logs.poses import interpolate, matrices, transform
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.kernels.fixed_order import norms, row_sums, turned
 from tilestream.label import start_errors
-from tilestream.model.dataset import with_derived
 from tilestream.model.domain import domain_of
-from tilestream.model.models import COMPETITORS
-from tilestream.model.protocols import block_splits
+from tilestream.model.features import with_derived
+from tilestream.model.registry import COMPETITORS
+from tilestream.model.splits import block_splits
 from tilestream.records import Scan, Trajectory
 
 Floats = NDArray[np.float64]
@@ -199,11 +199,11 @@ def test_how_many_threads_share_a_product_does_not_show() -> None:
     """A process of its own has as many as the machine has cores, a Dask worker one."""
     data = dataset(1, related=0.9, lengths={"a": 1500, "b": 1500})
     split = block_splits(data)[0]
-    train, judged = data.take(split.train), data.take(split.test)
+    train, test = data.take(split.train), data.take(split.test)
     found = []
     for threads in (1, 2):
         with threadpool_limits(threads, "blas"):
-            found.append(COMPETITORS["pcr"](train, judged, "error_mean", 0))
+            found.append(COMPETITORS["pcr"].fit(train, "error_mean").predict(test.rows))
     np.testing.assert_array_equal(*found)
 
 
@@ -234,8 +234,9 @@ MAY = {
     "kernels/neighbours.py": "whole numbers",
     "label.py": "3 x 3 of one pose",
     "model/domain.py": "over all training places, in one thread",
-    "model/reasons.py": "over all training places, in one thread",
+    "model/explain.py": "over all training places, in one thread",
     "registration.py": "3 x 3 of one pose or one cell",
+    "sensor.py": "3 x 3 of one mount",
     "simulation/drive.py": "over one drive",
     "simulation/lidar.py": "over one scan",
     "simulation/mesh.py": "over one tree",

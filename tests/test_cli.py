@@ -32,7 +32,8 @@ from tilestream.formats.points.pcd import write_pcd
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.cluster import TlsFiles
 from tilestream.pipeline.jobs.run_inputs import inputs_of, read_map
-from tilestream.settings import RunSettings, bytes_of
+from tilestream.pipeline.jobs.run_settings import RunSettings
+from tilestream.settings import bytes_of
 
 Told = pytest.CaptureFixture[str]
 

@@ -14,8 +14,9 @@ from tilestream.formats.points.pcd import write_pcd
 from tilestream.formats.routes import read_routes
 from tilestream.pipeline.jobs.run_inputs import degraded_drives, inputs_of, observing_of
 from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
+from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.stages.map_plan import MapPlan
-from tilestream.settings import DriveSettings, RunSettings
+from tilestream.settings import DriveSettings
 from tilestream.store import open_store
 from tilestream.tables import read_tables
 

@@ -10,7 +10,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -34,11 +34,11 @@ from tilestream.errors import (
     SourceNotFoundError,
     UsageError,
 )
-from tilestream.model import evaluation, models, training
+from tilestream.model import evaluation, forest, registry, training
 from tilestream.model.dataset import TARGETS
+from tilestream.model.file import load_model, save_model
+from tilestream.model.forest import Growth, PaperForest
 from tilestream.model.intervals import coverage
-from tilestream.model.model_file import load_model, save_model
-from tilestream.model.models import Recipe
 from tilestream.model.training import PREDICTION_COLUMNS
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.cluster import dask_client
@@ -50,7 +50,7 @@ from tilestream.pipeline.jobs.forecast import forecast
 from tilestream.pipeline.jobs.run_book import Book
 from tilestream.pipeline.jobs.run_inputs import check_model, inputs_of, making_of
 from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
-from tilestream.pipeline.jobs.run_settings import read_settings
+from tilestream.pipeline.jobs.run_settings import ModelSettings, RunSettings, read_settings
 from tilestream.pipeline.stages import predict as predict_stage
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.terms import terms
@@ -60,9 +60,7 @@ from tilestream.settings import (
     DriveSettings,
     LabelSettings,
     MapSettings,
-    ModelSettings,
     ReportSettings,
-    RunSettings,
     SimulateSettings,
     VirtualSettings,
 )
@@ -98,14 +96,10 @@ def small_forests(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        quick = Recipe(trees=5)
-        patch.setattr(models, "PAPER", quick)
-        patch.setattr(models, "CANDIDATES", (Recipe(trees=4, leaf=2, log=True),))
-        patch.setattr(training, "PAPER", quick)
-        patch.delitem(models.COMPETITORS, "mlp")  # a thousand passes over the data
+        patch.setattr(PaperForest, "defaults", asdict(Growth(trees=5)))
+        patch.setattr(forest, "CANDIDATES", (Growth(trees=4, leaf=2, log=True),))
+        patch.delitem(registry.COMPETITORS, "mlp")  # a thousand passes over the data
         patch.setattr(pictures.png, "__defaults__", (20,))
-        patch.setattr(evaluation.importances, "__defaults__", ("error_mean", quick, 0))
-        patch.setattr(evaluation.criterion_importances, "__defaults__", ("error_mean", quick, 0))
         yield
 
 
@@ -211,7 +205,7 @@ def test_the_evaluation_has_every_protocol_and_opponent(done: tuple[Path, Told])
     found = json.loads((done[0] / "tables" / "evaluation.json").read_text())
     protocols = pd.DataFrame(found["protocols"])
     judged = protocols[protocols["reason"] == ""]
-    assert set(judged["model"]) == set(models.COMPETITORS) - set(models.PHYSICS)
+    assert set(judged["model"]) == set(registry.COMPETITORS) - {registry.UNTRAINED}
     assert {"paper", "path"} <= set(judged["protocol"])
     assert set(protocols["protocol"]) == {"paper", "path", "blocks"}
     blocks = protocols[protocols["protocol"] == "blocks"]
@@ -342,10 +336,10 @@ def test_a_task_that_fails_keeps_nothing_else_from_its_end(
     assert places.loc["tunnel", "estimate"].isna().all()
     assert places.loc["tunnel", "reason"].str.contains("task failed").all()
     assert places.loc[["canyon", "crossing"], "estimate"].notna().all()
-    the_recipe_in_use_is_judged(copy, "paper")
+    the_recipe_in_use_is_evaluated(copy, "paper")
 
 
-def the_recipe_in_use_is_judged(folder: Path, recipe: str) -> None:
+def the_recipe_in_use_is_evaluated(folder: Path, recipe: str) -> None:
     """Held-out lines, intervals, parts and the verdict are of the model that made the estimates."""
     report = json.loads((folder / "report" / "report.json").read_text())
     assert report["model"] == recipe
@@ -592,6 +586,7 @@ LEARNING = "out: run\nmap: {sources: [a.pcd]}\nroutes: [r.csv]\nsimulate: {}\n"
         (JOB + "simulate: {prset: paper}", r"simulate: prset is no .*did you mean preset"),
         (LEARNING + "observe: {range_mx: 3}", r"observe: range_mx is no .*did you mean range_max"),
         (LEARNING + "model: {recip: paper}", r"model: recip is no .*did you mean recipe"),
+        (LEARNING + "model: {recipe: best}", r"recipe is 'best': choose from paper, .*physics"),
         (LEARNING + "report: {treshold: 1}", r"report: treshold is no .*did you mean threshold"),
         (LEARNING + "label: {matcher: {solvr: raw}}", r"matcher.*: solvr is no .*mean solver"),
         (LEARNING + "label: {matcher: {solver: best}}", r"matcher.*: solver is 'best'.* or 'raw'"),

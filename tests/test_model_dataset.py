@@ -1,22 +1,16 @@
-"""Factors and errors are joined by place; what is lost is counted; the judged are far away."""
+"""Factors and errors are joined by place; what is lost is counted; the held-out are far away."""
 
 import numpy as np
 import pandas as pd
 import pytest
-from forest_data import COLUMNS, WEAK_AXIS, dataset, drives
+from model_data import COLUMNS, WEAK_AXIS, dataset, drives
 
 from tilestream.errors import ModelError, UsageError
-from tilestream.model.dataset import (
-    PLACE,
-    TARGETS,
-    Dataset,
-    features_of,
-    join,
-    made_with,
-    with_derived,
-)
+from tilestream.model.dataset import TARGETS, Dataset, made_with
 from tilestream.model.evaluation import factor_sets
-from tilestream.model.protocols import PROTOCOLS, block_splits, leave_path_out, random_split
+from tilestream.model.features import features_of, with_derived
+from tilestream.model.join import PLACE, join
+from tilestream.model.splits import PROTOCOLS, block_splits, leave_path_out, random_split
 from tilestream.records import Column
 from tilestream.sensor import VLP16
 
@@ -157,12 +151,12 @@ def test_blocks_do_not_depend_on_what_was_lost(short: tuple[pd.DataFrame, pd.Dat
     assert (part["block"] == whole.loc[part.index, "block"]).all()
 
 
-def test_every_point_is_judged_once_and_far_from_what_trained() -> None:
+def test_every_point_is_held_out_once_and_far_from_what_trained() -> None:
     found = dataset(2, lengths={"a": 650, "b": 400, "c": 300})
     at = found.rows[["x", "y"]].to_numpy()
     for splits in (leave_path_out(found), block_splits(found)):
-        judged = np.concatenate([split.test for split in splits])
-        assert np.array_equal(np.sort(judged), np.arange(len(found)))
+        tested = np.concatenate([split.test for split in splits])
+        assert np.array_equal(np.sort(tested), np.arange(len(found)))
         for split in splits:
             apart = np.abs(at[split.train, None] - at[None, split.test])
             assert np.hypot(apart[..., 0], apart[..., 1]).min() > 100.0

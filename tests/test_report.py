@@ -29,7 +29,7 @@ from report_json import sources
 from tilestream.errors import CrsError, TileNotReadyError, UsageError
 from tilestream.factors import catalogue, observability
 from tilestream.formats import open_source
-from tilestream.model.dataset import SPREAD_ACROSS, SPREAD_ALONG, WEAK_ALONG
+from tilestream.model.features import SPREAD_ACROSS, SPREAD_ALONG, WEAK_ALONG
 from tilestream.records import Float64
 from tilestream.report import Findings, gate, write_report
 from tilestream.report.charts import MOST, city_map

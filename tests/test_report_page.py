@@ -29,8 +29,8 @@ from report_json import charts, source
 
 import tilestream.report
 from tilestream.model.dataset import TARGETS
-from tilestream.model.models import COMPETITORS
-from tilestream.model.protocols import PROTOCOLS
+from tilestream.model.registry import COMPETITORS
+from tilestream.model.splits import PROTOCOLS
 from tilestream.report import Findings, write_report
 from tilestream.report.charts import path_chart
 from tilestream.report.evaluation import MODELS, PAPER_IMPORTANCES, PARTS, PROTOCOL_NAMES

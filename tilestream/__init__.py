@@ -37,6 +37,7 @@ from tilestream.pipeline.jobs.along_routes import factors_along as factors_along
 from tilestream.pipeline.jobs.along_routes import observe_along as observe_along
 from tilestream.pipeline.jobs.ingest import ingest as ingest
 from tilestream.pipeline.jobs.localize import localize as localize
+from tilestream.pipeline.jobs.run_settings import RunSettings as RunSettings
 from tilestream.records import Cells as Cells
 from tilestream.records import LocalizationError as LocalizationError
 from tilestream.records import Registrations as Registrations
@@ -47,7 +48,6 @@ from tilestream.sensor import OS1_128 as OS1_128
 from tilestream.sensor import VLP16 as VLP16
 from tilestream.sensor import Sensor as Sensor
 from tilestream.settings import RegistrationSettings as RegistrationSettings
-from tilestream.settings import RunSettings as RunSettings
 from tilestream.settings import StartSettings as StartSettings
 from tilestream.settings import VirtualSettings as VirtualSettings
 from tilestream.store import Tile as Tile

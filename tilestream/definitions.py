@@ -21,16 +21,17 @@ from tilestream.config import Settings
 from tilestream.errors import UsageError
 from tilestream.factors import catalogue, observability
 from tilestream.factors.rows import PLACE_COLUMNS, STATUS_COLUMNS
-from tilestream.model.dataset import TARGETS, features_of
+from tilestream.model.dataset import TARGETS
+from tilestream.model.features import features_of
 from tilestream.model.training import PREDICTION_COLUMNS
-from tilestream.pipeline.stages.evaluate import JUDGED_COLUMNS
+from tilestream.pipeline.jobs.run_settings import RunSettings
+from tilestream.pipeline.stages.evaluate import HELD_OUT_COLUMNS
 from tilestream.pipeline.stages.importance import WEIGHT_COLUMNS
 from tilestream.pipeline.stages.label import ERROR_COLUMNS
 from tilestream.pipeline.stages.register import START_COLUMNS
 from tilestream.pipeline.stages.samples import COLUMNS as ALL_FACTORS
 from tilestream.pipeline.stages.samples import DATASET_COLUMNS, LOST_COLUMNS
 from tilestream.records import Column
-from tilestream.settings import RunSettings
 from tilestream.simulation.settings import SimulationSettings
 
 TABLES: dict[str, tuple[Column, ...]] = {
@@ -49,7 +50,7 @@ TABLES: dict[str, tuple[Column, ...]] = {
         *features_of(ALL_FACTORS),
     ),
     "lost": LOST_COLUMNS,
-    "judged": JUDGED_COLUMNS,
+    "judged": HELD_OUT_COLUMNS,
     "weights": WEIGHT_COLUMNS,
     "predictions": (*PLACE_COLUMNS, *PREDICTION_COLUMNS),
 }

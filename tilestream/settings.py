@@ -1,14 +1,15 @@
 """Every knob of the jobs, once: name, unit, meaning and default.
 
-The YAML file of a job is `RunSettings`. The options of the command line are made from these fields
-(`cli/fields.py`), and the keywords of the Python jobs have the same names and defaults
-(tests/test_settings.py). The simulated city has a file of its own (`simulation/settings.py`).
+The YAML file of a job puts them together (`RunSettings` in `pipeline/jobs/run_settings.py`, with the
+choice of the model). The options of the command line are made from these fields (`cli/fields.py`),
+and the keywords of the Python jobs have the same names and defaults (tests/test_settings.py). The
+simulated city has a file of its own (`simulation/settings.py`).
 """
 
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field
 
 from tilestream.config import Settings
 from tilestream.errors import UsageError
@@ -259,20 +260,6 @@ class SimulateSettings(Settings):
     """Where it is kept; not given: `simulation` in the run directory."""
 
 
-class ModelSettings(Settings):
-    """How the errors of the measured places become those of all places."""
-
-    recipe: Literal["default", "paper", "physics"] = "default"
-    """Ours, tuned on held-out blocks; the paper's forest; or no forest and no training: the virtual
-    drive as it is."""
-    offset: Annotated[float, Field(ge=0.0)] = 0.0
-    """With `physics`: what a real scan adds to the error of a virtual one [m]."""
-    use: str | None = None
-    """A model file to use instead of training; not given: train on the drives."""
-    seed: int = 0
-    """Seed of the forests."""
-
-
 class ReportSettings(Settings):
     """What the report points out."""
 
@@ -308,55 +295,3 @@ class PlaceSettings(Settings):
     def looking_sensor(self) -> Sensor:
         """The sensor as which the paper's factors look: the first."""
         return self.vehicle.sensors[0]
-
-
-class RunSettings(PlaceSettings):
-    """The main job: from map and drives to the estimated error of every sample point."""
-
-    out: str
-    """The run directory."""
-    simulate: SimulateSettings | None = None
-    """Simulate a city; null: real files."""
-    map: MapSettings = MapSettings()
-    """The map."""
-    drives: tuple[DriveSettings, ...] = ()
-    """The logs to measure on; empty with `simulate`: its drives."""
-    routes: tuple[str, ...] = ()
-    """Files of routes to estimate along; empty: those of the simulation, or of the drives; without
-    drives, all lanes of a map directory with `lanelet2_map.osm` among the sources."""
-    observe: VirtualSettings | None = VirtualSettings()
-    """How the vehicle's lidar sees in the virtual drive: usable range, blind sector, starts; null:
-    no virtual drive, the paper's factors and their twins only."""
-    label: LabelSettings = LabelSettings()
-    """How errors are measured."""
-    model: ModelSettings = ModelSettings()
-    """How they are estimated."""
-    report: ReportSettings = ReportSettings()
-    """What is reported."""
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        names = [drive.group for drive in self.drives]
-        twice = sorted({name for name in names if names.count(name) > 1})
-        if twice:
-            raise ValueError(f"has two drives named {', '.join(twice)}: give each its own name")
-        if self.simulate is None and not self.map.sources and self.map.store is None:
-            raise ValueError("has no map: give map.sources (files), map.store, or simulate")
-        physics = self.model.recipe == "physics"
-        if not (self.simulate or self.drives or self.model.use or physics):
-            raise ValueError("has nothing to learn from: give drives, simulate, or model.use")
-        if physics and (self.observe is None or self.model.use):
-            raise ValueError("has model.recipe physics, which needs observe and no model.use")
-        if not (self.simulate or self.drives or self.routes or self.map.sources):
-            raise ValueError("has no routes: give files of routes, or drives")
-        return self
-
-    @property
-    def folder(self) -> Path:
-        """The run directory."""
-        return Path(self.out)
-
-    @property
-    def store_url(self) -> str:
-        """Where the tile store is."""
-        return self.map.store or str(self.folder / "map.zarr")

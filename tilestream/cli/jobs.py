@@ -19,11 +19,11 @@ from tilestream.pipeline.jobs import run as main_job
 from tilestream.pipeline.jobs import simulate as simulation
 from tilestream.pipeline.jobs.forecast import forecast
 from tilestream.pipeline.jobs.run_inputs import extent
-from tilestream.pipeline.jobs.run_settings import read_settings
+from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
 from tilestream.pipeline.stages.simulated import SCENE_BYTES
 from tilestream.report import cards, gate
 from tilestream.report.segments import MISSING, check_threshold
-from tilestream.settings import RunSettings, SimulateSettings
+from tilestream.settings import SimulateSettings
 from tilestream.simulation.settings import SimulationSettings, load_preset
 
 SHIPPED = resources.files("tilestream") / "data"

@@ -1,4 +1,4 @@
-"""Is this place like the training places? A forest answers either way, so something must ask."""
+"""Is a place like the training places? A regressor gives an estimate either way."""
 
 from dataclasses import dataclass
 
@@ -32,9 +32,8 @@ class Domain:
         """(n,) distance from the middle, in typical distances; the same bits for any company."""
         z = (X - self.middle) / self.scale
         total = np.zeros(len(X))
-        for (
-            row
-        ) in self.whitening:  # not a matrix product: its rounding depends on the number of rows
+        # Not a matrix product: its rounding depends on the number of rows.
+        for row in self.whitening:
             part = np.zeros(len(X))
             for k in range(len(row)):
                 part += z[:, k] * row[k]
@@ -52,7 +51,7 @@ def domain_of(X: Float64, block: NDArray[np.str_]) -> Domain:
 
     The threshold is the 99 % quantile of the distances of each block's points from the cloud of the
     other blocks, every block weighing the same: a new place is as far from the training places as
-    they are from each other. A single block judges itself.
+    they are from each other. A single block is compared with itself.
 
     Args:
         X: (n, f) factors, all finite.

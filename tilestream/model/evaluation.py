@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -9,8 +10,9 @@ from scipy.stats import spearmanr
 
 from tilestream.errors import ModelError
 from tilestream.model.dataset import Dataset
-from tilestream.model.models import COMPETITORS, PAPER, Forest, Recipe, grow
-from tilestream.model.protocols import PROTOCOLS, Split, block_splits
+from tilestream.model.registry import COMPETITORS
+from tilestream.model.regressor import Regressor
+from tilestream.model.splits import PROTOCOLS, Split, block_splits
 from tilestream.records import Column, Float64
 
 CRITERIA = ("FS", "RQ", "LY", "LS")
@@ -34,7 +36,7 @@ class Figures:
     """How far estimates are from what was measured."""
 
     points: int
-    """Points judged."""
+    """How many points."""
     rmse: float
     """Root mean square error [unit of the target; m for lengths]."""
     mae: float
@@ -44,8 +46,8 @@ class Figures:
     within_50mm: float
     """Share of the points estimated with an error below 5 cm."""
     r2: float
-    """1 - squared error / squared deviation from the mean of the judged points; NaN if they are
-    all alike."""
+    """1 - squared error / squared deviation from the mean of the labels; NaN if they are all
+    alike."""
     skill: float
     """1 - MAE / MAE of the training median; NaN if that is 0."""
     spearman: float
@@ -61,10 +63,10 @@ def figures(actual: Float64, estimate: Float64, median: Float64) -> Figures:
         median: (n,) the training median at each point, for the skill.
 
     Raises:
-        ModelError: nothing to judge.
+        ModelError: no points.
     """
     if not len(actual):
-        raise ModelError("no points to judge")
+        raise ModelError("no points to evaluate")
     error = np.abs(estimate - actual)
     spread = float(((actual - actual.mean()) ** 2).sum())
     of_median = float(np.abs(median - actual).mean())
@@ -91,17 +93,17 @@ def held_out(
     """What a competitor estimates for points that it has not seen.
 
     Returns:
-        A row per judged point: `row` of the dataset, `fold`, `group`, `path`, `block`,
+        A row per held-out point: `row` of the dataset, `fold`, `group`, `path`, `block`,
         `arc_length` [m], `actual`, `estimate`, `median` (of the training part).
     """
     parts = []
     for split in splits:
-        train, judged = dataset.take(split.train), dataset.take(split.test)
-        part = judged.rows[["group", "path", "block", "arc_length"]].assign(
+        train, test = dataset.take(split.train), dataset.take(split.test)
+        part = test.rows[["group", "path", "block", "arc_length"]].assign(
             row=split.test,
             fold=split.name,
-            actual=judged.label(target),
-            estimate=COMPETITORS[competitor](train, judged, target, seed),
+            actual=test.label(target),
+            estimate=COMPETITORS[competitor].fit(train, target, seed).predict(test.rows),
             median=float(np.median(train.label(target))),
         )
         parts.append(part)
@@ -133,7 +135,7 @@ def factor_sets(columns: Sequence[Column]) -> dict[str, tuple[Column, ...]]:
     return {name: chosen for name, chosen in sets.items() if chosen}
 
 
-def judge(
+def cross_validate(
     dataset: Dataset, competitor: str, target: str = "error_mean", seed: int = 0
 ) -> dict[str, pd.DataFrame | str]:
     """What a competitor estimates for points that it has not seen, by the name of the protocol.
@@ -152,15 +154,15 @@ def judge(
     return found
 
 
-def figures_by_protocol(judged: Mapping[str, pd.DataFrame | str], model: str) -> pd.DataFrame:
-    """What `judge` found as figures.
+def figures_by_protocol(found: Mapping[str, pd.DataFrame | str], model: str) -> pd.DataFrame:
+    """What `cross_validate` found as figures.
 
     Returns:
         A row per protocol: `protocol`, `model`, the fields of `Figures`, `reason` (why a protocol
         cannot be followed on this dataset; its figures are then NaN).
     """
     rows: list[dict[str, object]] = []
-    for protocol, points in judged.items():
+    for protocol, points in found.items():
         row: dict[str, object] = {"protocol": protocol, "model": model}
         if isinstance(points, str):
             rows.append(row | {"reason": points})
@@ -187,34 +189,42 @@ def ceiling(dataset: Dataset, target: str = "error_mean") -> Figures:
     return figures(pairs[target].to_numpy(), pairs[f"{target}_again"].to_numpy(), median)
 
 
-def importances(
-    dataset: Dataset, target: str = "error_mean", recipe: Recipe = PAPER, seed: int = 0
-) -> pd.DataFrame:
-    """The forest's own importances, as in Table IV: biased, since the counts are all correlated.
+def importances_of(regressor: Regressor, columns: Sequence[Column]) -> pd.DataFrame:
+    """A regressor's own importances, as in Table IV.
+
+    Args:
+        regressor: a fitted one.
+        columns: the factors that it was fitted on, in its order.
 
     Returns:
         A row per factor: `factor`, `criterion`, `importance` (they sum to 1).
     """
-    return importances_of(grow(dataset, target, recipe, seed), dataset.columns)
-
-
-def importances_of(forest: Forest, columns: Sequence[Column]) -> pd.DataFrame:
-    """The same of a forest that has been grown on these factors."""
     return pd.DataFrame(
         {
             "factor": [column.name for column in columns],
             "criterion": [column.criterion for column in columns],
-            "importance": forest.trees.feature_importances_,
+            "importance": regressor.importances(),
         }
     )
 
 
 def criterion_importances(
-    dataset: Dataset, target: str = "error_mean", recipe: Recipe = PAPER, seed: int = 0
+    dataset: Dataset,
+    regressor: type[Regressor],
+    settings: Mapping[str, Any] | None = None,
+    target: str = "error_mean",
+    seed: int = 0,
 ) -> pd.DataFrame:
     """How much worse held-out blocks are estimated when a criterion's factors are permuted.
 
     All factors of a criterion move together, so what one of them knows cannot hide in another.
+
+    Args:
+        dataset: labelled places.
+        regressor: what is fitted without the held-out blocks.
+        settings: with which settings; None: tuned anew on each training part.
+        target: which label.
+        seed: of fits and permutations.
 
     Returns:
         A row per criterion: `criterion`, `factors` (how many), `increase` of the mean absolute
@@ -222,19 +232,19 @@ def criterion_importances(
     """
     splits = block_splits(dataset)
     criteria = list(dict.fromkeys(column.criterion for column in dataset.columns))
-    of = {c: [k for k, col in enumerate(dataset.columns) if col.criterion == c] for c in criteria}
+    of = {c: [col.name for col in dataset.columns if col.criterion == c] for c in criteria}
     rng = np.random.default_rng(seed)
     increase = {criterion: np.zeros(REPEATS) for criterion in criteria}
     for split in splits:
-        judged = dataset.take(split.test)
-        forest = grow(dataset.take(split.train), target, recipe, seed)
-        X, actual = judged.matrix(), judged.label(target)
-        plain = np.abs(forest.estimate(X) - actual).sum()
+        test = dataset.take(split.test)
+        fitted = regressor.fit(dataset.take(split.train), target, seed, settings)
+        places, actual = test.rows[test.names], test.label(target)
+        plain = np.abs(fitted.predict(places) - actual).sum()
         for criterion in criteria:
             for repeat in range(REPEATS):
-                moved = X.copy()
-                moved[:, of[criterion]] = X[rng.permutation(len(X))][:, of[criterion]]
-                worse = np.abs(forest.estimate(moved) - actual).sum() - plain
+                order = rng.permutation(len(places))
+                moved = places.assign(**{n: places[n].to_numpy()[order] for n in of[criterion]})
+                worse = np.abs(fitted.predict(moved) - actual).sum() - plain
                 increase[criterion][repeat] += worse / len(dataset)
     return pd.DataFrame(
         [

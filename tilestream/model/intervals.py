@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from tilestream.model.models import LEAST
+from tilestream.model.dataset import LEAST
 from tilestream.records import Float64
 
 LEVEL = 0.9

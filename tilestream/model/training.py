@@ -1,7 +1,8 @@
 """A model for every place: train it on a dataset, apply it to a table of factors."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,23 +11,16 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from tilestream.errors import ModelError, UsageError
-from tilestream.model.dataset import TARGETS, Dataset, with_derived
+from tilestream.model.dataset import TARGETS, Dataset, matrix
 from tilestream.model.domain import Domain, domain_of
+from tilestream.model.explain import PIECE, Typical, compared, in_words, typical_of
+from tilestream.model.features import with_derived
 from tilestream.model.intervals import LEVEL, NOT_CALIBRATED, Interval, calibrate
-from tilestream.model.models import PAPER, Forest, Recipe, grow, telling, tuned
-from tilestream.model.protocols import block_splits
-from tilestream.model.reasons import (
-    PIECE,
-    Typical,
-    compared,
-    contributions,
-    in_words,
-    typical_of,
-)
+from tilestream.model.registry import DEFAULT, REGRESSORS
+from tilestream.model.regressor import Regressor, held_out_estimates
+from tilestream.model.splits import block_splits
 from tilestream.records import Column, Float64
 
-RECIPES = ("default", "paper")
-"""Ours, whose leaf is chosen on held-out blocks, and the paper's."""
 MAIN = "error_mean"
 ESTIMATES = {
     "error_mean": "estimate",
@@ -84,8 +78,8 @@ PREDICTION_COLUMNS = (
 class Model:
     """All that is needed to estimate the error of any place of a map."""
 
-    forests: Mapping[str, Forest]
-    """The forest of each target."""
+    regressors: Mapping[str, Regressor]
+    """The regressor of each target, all of one class."""
     domain: Domain
     """The training places, by the features."""
     typical: Typical
@@ -101,54 +95,49 @@ class Model:
     worst: float
     """Estimates above this are given a reason [m]."""
     facts: Mapping[str, Any]
-    """How it was trained: recipe, seed, points, paths, targets left out and why."""
-
-    @property
-    def recipe(self) -> Recipe:
-        """How its forests were grown."""
-        return Recipe(**{part.name: self.facts[part.name] for part in fields(Recipe)})
+    """How it was trained: recipe, settings, seed, points, paths, targets left out and why."""
 
 
 def train(
-    dataset: Dataset, *, recipe: str = "default", seed: int = 0, n_jobs: int | None = 1
+    dataset: Dataset, *, recipe: str = DEFAULT, seed: int = 0, n_jobs: int | None = 1
 ) -> Model:
     """Train a model on all points of a dataset, and calibrate it on held-out blocks.
 
     Args:
         dataset: labelled places.
-        recipe: `default` or `paper` (`RECIPES`).
+        recipe: name of the regressor (`REGRESSORS`).
         seed: of the random numbers; the same seed and rows give the same model, to the bit.
-        n_jobs: while growing trees; None: what joblib's context says (Dask).
+        n_jobs: threads or processes; None: what joblib's context says (Dask).
 
     Raises:
         ModelError: the dataset is too small, all alike, or mixed (`Dataset.check`).
         UsageError: an unknown recipe.
     """
-    if recipe not in RECIPES:
-        raise UsageError(f"no recipe {recipe!r}: choose from {', '.join(RECIPES)}")
+    if recipe not in REGRESSORS:
+        raise UsageError(f"no recipe {recipe!r}: choose from {', '.join(sorted(REGRESSORS))}")
+    regressor = REGRESSORS[recipe]
     dataset.check(MAIN)
     pieces = dataset.rows.groupby(["path", dataset.rows["arc_length"] // PIECE]).ngroups
-    whole, dataset = dataset, dataset if recipe == "paper" else telling(dataset)
+    whole, dataset = dataset, dataset.with_columns(regressor.features(dataset.columns))
     rows = dataset.rows
     with threadpool_limits(1, "blas"):  # how many threads share a product shows in its last bits
         typical = typical_of(whole.matrix(), whole.label(MAIN), whole.columns, pieces)
         domain = domain_of(dataset.matrix(), rows["block"].to_numpy(str))
-    grown = PAPER if recipe == "paper" else tuned(dataset, MAIN, seed, n_jobs)
+    settings = regressor.tuned(dataset, MAIN, seed, n_jobs)
     # An axis or a tail that is the same everywhere teaches nothing and is learnt as that constant.
     there = [target for target in TARGETS if target in dataset.rows]
-    forests = {target: grow(dataset, target, grown, seed, n_jobs) for target in there}
     return Model(
-        forests=forests,
+        regressors={t: regressor.fit(dataset, t, seed, settings, n_jobs) for t in there},
         domain=domain,
         typical=typical,
-        interval=_interval(dataset, grown, seed, n_jobs),
+        interval=_interval(dataset, regressor, settings, seed, n_jobs),
         factors=tuple(dataset.names),
         made_with=dataset.made_with,
         data_set=next(iter(dataset.data_sets.values()), {}),
         worst=float(np.quantile(dataset.label(MAIN), WORST)),
         facts={
             "recipe": recipe,
-            **asdict(grown),
+            **settings,
             "seed": seed,
             "points": len(dataset),
             "groups": sorted(set(rows["group"])),
@@ -159,21 +148,25 @@ def train(
     )
 
 
-def _interval(dataset: Dataset, recipe: Recipe, seed: int, n_jobs: int | None) -> Interval:
-    """The interval, from what forests say of blocks that they have not seen.
+def _interval(
+    dataset: Dataset,
+    regressor: type[Regressor],
+    settings: Mapping[str, Any],
+    seed: int,
+    n_jobs: int | None,
+) -> Interval:
+    """The interval, from estimates of blocks that the regressor has not seen.
 
-    The recipe was chosen on these blocks too, so the interval is a little narrower than one whose
-    recipe had been chosen anew for each fold: one of three recipes, judged on all blocks, is all
-    that a held-out block has told.
+    The settings were chosen on these blocks too, so the interval is a little narrower than one
+    whose settings had been chosen anew for each fold. The effect is small: a held-out block only
+    had a part in choosing one of a few candidates.
     """
     try:
         splits = block_splits(dataset)
     except ModelError:
         return NOT_CALIBRATED
-    estimate = np.empty(len(dataset))
-    for split in splits:
-        forest = grow(dataset.take(split.train), MAIN, recipe, seed, n_jobs)
-        estimate[split.test] = forest.estimate(dataset.take(split.test).matrix())
+    fit = partial(regressor.fit, target=MAIN, seed=seed, settings=settings, n_jobs=n_jobs)
+    estimate = held_out_estimates(dataset, splits, fit)
     blocks = dataset.rows["block"].to_numpy(str)
     return calibrate(dataset.label(MAIN), estimate, blocks, LEVEL)
 
@@ -208,8 +201,9 @@ def predict(
     good = np.asarray(np.isfinite(X).all(axis=1))
     out = {c.name: np.full(len(X), np.nan) for c in PREDICTION_COLUMNS if c.dtype == "float64"}
     if good.any():
-        for target, forest in model.forests.items():
-            out[ESTIMATES[target]][good] = forest.estimate(X[good])
+        places = pd.DataFrame(X[good], columns=list(model.factors))
+        for target, regressor in model.regressors.items():
+            out[ESTIMATES[target]][good] = regressor.predict(places)
         out["low"], out["high"] = model.interval.around(out["estimate"])
         out["domain_distance"][good] = model.domain.distance(X[good])
     in_domain = np.logical_and(good, out["domain_distance"] <= model.domain.threshold)
@@ -229,7 +223,7 @@ def _matrix(model: Model, table: pd.DataFrame) -> Float64:
     wrong = [name for name in model.factors if table[name].dtype.kind not in "iufb"]
     if wrong:
         raise ModelError(f"factors that are no numbers: {', '.join(wrong)}")
-    return np.ascontiguousarray(table[list(model.factors)].to_numpy(np.float64))
+    return matrix(table, model.factors)
 
 
 def check_making(model: Model, made_with: Mapping[str, Any]) -> None:
@@ -279,7 +273,7 @@ def check_making(model: Model, made_with: Mapping[str, Any]) -> None:
 
 
 def _short(values: Mapping[str, Any], names: Sequence[str]) -> str:
-    """Some of the values; of lists their length."""
+    """The values of these names as text; of lists their length."""
     said = {k: values.get(k) for k in ("name", *names) if k in values}
     short = {k: f"{len(v)} values" if isinstance(v, list | tuple) else v for k, v in said.items()}
     return ", ".join(f"{name} {value}" for name, value in short.items())
@@ -293,11 +287,14 @@ def _reasons(
     good: NDArray[np.bool_],
     in_domain: NDArray[np.bool_],
 ) -> list[str]:
-    """For the worst places, the strange ones, and those without an estimate."""
+    """(n,) words for the worst places, those outside the domain and those without an estimate; else
+    empty.
+    """
     words = np.full(len(X), "", dtype=object)
     worst = np.flatnonzero(good & (estimate > model.worst))
     if worst.size:
-        added = contributions(model.forests[MAIN].trees, X[worst])
+        places = pd.DataFrame(X[worst], columns=list(model.factors))
+        added = model.regressors[MAIN].contributions(places)
         values = _values(table.iloc[worst], model.typical.names)
         words[worst] = in_words(added, model.factors, values, model.typical)
     strange = np.flatnonzero(good & ~in_domain)

@@ -9,6 +9,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from tilestream.errors import UsageError
+from tilestream.model.registry import DEFAULT
 from tilestream.model.training import PREDICTION_COLUMNS
 from tilestream.records import Float64
 
@@ -51,7 +52,7 @@ class Findings:
     table_iv: pd.DataFrame = field(default_factory=_none)
     """The same of each factor set, with the column `factors`: its name."""
     importances: pd.DataFrame = field(default_factory=_none)
-    """`evaluation.importances`, with the column `model`: `used` of the forest that made the
+    """`evaluation.importances_of`, with the column `model`: `used` of the forest that made the
     estimates, `paper` of the paper's on its own factors."""
     criterion_importances: pd.DataFrame = field(default_factory=_none)
     """`evaluation.criterion_importances`, likewise; `paper` on all factors."""
@@ -59,7 +60,7 @@ class Findings:
     """`intervals.coverage`."""
     ceilings: dict[str, dict[str, float]] = field(default_factory=dict)
     """The fields of `evaluation.ceiling`'s figures by target; empty without a repeated drive."""
-    model: str = "default"
+    model: str = DEFAULT
     """Which of the models of `protocols` has made the estimates; one that is not among them was
     trained elsewhere."""
     facts: dict[str, Any] = field(default_factory=dict)

@@ -1,10 +1,11 @@
 """What the page says about the models: which there are, and how good each is on unseen places."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, get_args
 
-from tilestream.model.models import FORESTS, OPPONENTS, OTHERS
-from tilestream.model.protocols import PROTOCOLS
+from tilestream.model.registry import COMPETITORS
+from tilestream.model.regressor import Kind
+from tilestream.model.splits import PROTOCOLS
 from tilestream.report.formatting import known
 
 Row = Mapping[str, Any]
@@ -25,23 +26,13 @@ PAPER_IMPORTANCES = {
     "score_H": 0.02, "pfh_sim_H": 0.10, "pfh_sim_mnht": 0.06, "bhatt_sim": 0.23,
 }  # fmt: skip
 """The last column of the paper's Table IV."""
-OURS = (*FORESTS, "physics")
-"""What the claim is made for."""
-KINDS = {"ours": OURS, "the paper's other models": OTHERS, "opponents": OPPONENTS}
-"""Models by what they stand for."""
-MODELS = {
-    "paper": "forest, the paper's setting",
-    "default": "forest, tuned on held-out blocks",
-    "physics": "the virtual drive in the map, without a forest",
-    "pcr": "principal component regression",
-    "mlp": "multi-layer perceptron",
-    "svr": "support vector regression",
-    "sgd": "linear, stochastic gradient descent",
-    "training median": "the training median everywhere",
-    "path median": "the median of the same path",
-    "nearest training point": "the nearest training point",
-    "footprint forest": "forest on seven 2-D factors: directions of walls, azimuths",
+KINDS: dict[str, list[str]] = {
+    kind: [name for name, one in COMPETITORS.items() if one.kind == kind] for kind in get_args(Kind)
 }
+"""Models by what they stand for."""
+OURS, OPPONENTS = KINDS["ours"], KINDS["opponents"]
+"""What the claim is made for, and what it must beat."""
+MODELS = {name: one.words for name, one in COMPETITORS.items()}
 """What a competitor is, in words."""
 PROTOCOL_NAMES = {
     "paper": "random split",

@@ -18,7 +18,7 @@ from tilestream.factors import catalogue, observability
 from tilestream.factors.rows import PLACE_COLUMNS
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.formats.points.rows import writing_whole
-from tilestream.model.dataset import SPREAD_ACROSS, SPREAD_ALONG, WEAK_ALONG
+from tilestream.model.features import SPREAD_ACROSS, SPREAD_ALONG, WEAK_ALONG
 from tilestream.model.training import PREDICTION_COLUMNS
 from tilestream.records import Float64
 from tilestream.report.colours import scale_of

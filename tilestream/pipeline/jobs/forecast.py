@@ -22,10 +22,11 @@ from tilestream.pipeline.jobs.run_inputs import (
     simulations,
 )
 from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
+from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.jobs.simulate import plan_simulation
 from tilestream.pipeline.stages.map_plan import MapPlan, TilePoints
 from tilestream.pipeline.stages.scatter import SourceSpan
-from tilestream.settings import RunSettings, SimulateSettings
+from tilestream.settings import SimulateSettings
 from tilestream.store import StoreSettings, TileStore, open_store
 
 

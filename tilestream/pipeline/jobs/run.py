@@ -18,7 +18,7 @@ import yaml
 
 from tilestream.errors import PartialError, UsageError
 from tilestream.model.dataset import Dataset
-from tilestream.model.model_file import load_model
+from tilestream.model.file import load_model
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.cluster import report_kept
 from tilestream.pipeline.engine.costs import learn
@@ -36,12 +36,11 @@ from tilestream.pipeline.jobs.run_inputs import (
     read_map,
 )
 from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
-from tilestream.pipeline.jobs.run_settings import read_settings
+from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.samples import DatasetFile
 from tilestream.report import write_report
 from tilestream.report.summary import plain
-from tilestream.settings import RunSettings
 from tilestream.store import TileStore, open_store
 from tilestream.tables import remove_others
 
@@ -295,7 +294,7 @@ def _on_degraded(settings: RunSettings, inputs: Inputs) -> list[str]:
 
 def _model_facts(settings: RunSettings, book: Book) -> dict[str, Any]:
     """Where the model comes from, and how it was grown."""
-    if settings.model.recipe == "physics":
+    if settings.model.untrained:
         return {"from": "none: the virtual drive as it is", "offset [m]": settings.model.offset}
     if settings.model.use is not None:
         return {"from": settings.model.use, **load_model(settings.model.use).facts}

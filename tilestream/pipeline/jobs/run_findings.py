@@ -13,15 +13,15 @@ from tilestream.grid import MM_PER_M, Box
 from tilestream.model.dataset import TARGETS, Dataset
 from tilestream.model.evaluation import ceiling, factor_sets, figures_by_protocol
 from tilestream.model.intervals import coverage
-from tilestream.model.models import FORESTS
+from tilestream.model.registry import REGRESSORS
 from tilestream.model.training import MAIN, PREDICTION_COLUMNS
 from tilestream.pipeline.engine.plan import paths_of
 from tilestream.pipeline.engine.stage import Task
+from tilestream.pipeline.jobs.run_settings import ModelSettings
 from tilestream.pipeline.stages.evaluate import by_protocol
 from tilestream.pipeline.stages.samples import places_with_factors
 from tilestream.records import Float64
 from tilestream.report.data import AROUND, Findings
-from tilestream.settings import ModelSettings
 from tilestream.store import TileStore
 from tilestream.tables import read_tables, remove_others
 
@@ -52,7 +52,7 @@ class Done:
         """The groups of labels that were seen with another lidar than the vehicle's."""
         return [group for task in self.outputs("samples") for group in task.takes.get("own_of", {})]
 
-    def judgements(self) -> dict[tuple[str, str, str], dict[str, pd.DataFrame | str]]:
+    def evaluations(self) -> dict[tuple[str, str, str], dict[str, pd.DataFrame | str]]:
         """What was evaluated, by (target, competitor, factor set; empty: all factors)."""
         return {
             (t.takes["target"], t.takes["competitor"], t.takes["factor_set"]): by_protocol(
@@ -131,22 +131,22 @@ def evaluation_of(
     sets: Sequence[str],
     recipe: str,
 ) -> dict[str, pd.DataFrame]:
-    """Judgements as tables: `protocols`, `table_iv`, `coverage`, and `parts` for other targets.
+    """Evaluations as tables: `protocols`, `table_iv`, `coverage`, and `parts` for other targets.
 
     Args:
-        found: what was judged (`Done.judgements`).
+        found: what was evaluated (`Done.evaluations`).
         sets: the factor sets of Table IV in its order; the last has all factors.
         recipe: the model whose intervals are checked.
     """
-    rows = {key: figures_by_protocol(judgement, key[1]) for key, judgement in found.items()}
+    rows = {key: figures_by_protocol(points, key[1]) for key, points in found.items()}
     protocols = [
         table for (target, _, chosen), table in rows.items() if (target, chosen) == (MAIN, "")
     ]
-    judged_as = {name: "" if name == sets[-1] else name for name in sets}
+    stored_as = {name: "" if name == sets[-1] else name for name in sets}
     four = [
         rows[MAIN, model, chosen].assign(factors=name)
-        for model in FORESTS
-        for name, chosen in judged_as.items()
+        for model in REGRESSORS
+        for name, chosen in stored_as.items()
         if (MAIN, model, chosen) in rows
     ]
     parts = [table.assign(target=t) for (t, _, _), table in rows.items() if t != MAIN]
@@ -190,7 +190,7 @@ def findings_of(
     be left out; of a model that was not trained on these labels all estimates are held out as they
     are.
     """
-    places, found = places_of(done), done.judgements()
+    places, found = places_of(done), done.evaluations()
     sets = [] if dataset is None else list(factor_sets(dataset.columns))
     tables = evaluation_of(found, sets, model.recipe)
     held = found.get((MAIN, model.recipe, ""), {}).get("path")
@@ -198,7 +198,7 @@ def findings_of(
     weights = paths_of(done.outputs("importance"))
     weighed = read_tables(weights) if weights else pd.DataFrame({"factor": []})
     ceiling_of = ceilings(dataset, TARGETS)
-    trained_here = model.use is None and model.recipe != "physics"
+    trained_here = model.use is None and not model.untrained
     gathered = Findings(
         title=title,
         places=places,
@@ -207,7 +207,7 @@ def findings_of(
             places,
             points if trained_here else None,
             done.seen_otherwise(),
-            model.offset if model.recipe == "physics" else None,
+            model.offset if model.untrained else None,
         ),
         protocols=tables["protocols"],
         table_iv=tables["table_iv"],

@@ -10,10 +10,11 @@ from tilestream.errors import ModelError, SourceNotFoundError, UsageError
 from tilestream.formats.logs import ScanSelection, is_log
 from tilestream.formats.routes import read_routes
 from tilestream.model.dataset import made_with
-from tilestream.model.model_file import load_model
+from tilestream.model.file import load_model
 from tilestream.model.training import check_making
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.jobs.ingest import Reading, read_sources
+from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.jobs.simulate import simulate
 from tilestream.pipeline.stages.drive_scans import Reading as DriveReading
 from tilestream.pipeline.stages.observe import Observing
@@ -25,7 +26,6 @@ from tilestream.settings import (
     IngestSettings,
     LogSettings,
     MapSettings,
-    RunSettings,
     SimulateSettings,
     VirtualSettings,
 )

@@ -9,9 +9,13 @@ from tilestream.factors import catalogue
 from tilestream.factors.rows import Samples, samples_by_tile
 from tilestream.factors.virtual_drive import NEIGHBOURS
 from tilestream.grid import MM_PER_M, TileGrid, TileKey
-from tilestream.model.dataset import TARGETS, TOLERANCE, features_of
+from tilestream.model.baselines import Median
+from tilestream.model.dataset import TARGETS
 from tilestream.model.evaluation import factor_sets
-from tilestream.model.models import COMPETITORS, PHYSICS
+from tilestream.model.features import features_of
+from tilestream.model.forest import PaperForest
+from tilestream.model.join import TOLERANCE
+from tilestream.model.registry import COMPETITORS, REGRESSORS, UNTRAINED
 from tilestream.model.training import MAIN
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.outputs import Parquet
@@ -27,6 +31,7 @@ from tilestream.pipeline.jobs.run_inputs import (
     reading_of,
     scans_of,
 )
+from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.stages.evaluate import evaluate
 from tilestream.pipeline.stages.factors import Looking
 from tilestream.pipeline.stages.importance import importance
@@ -35,10 +40,10 @@ from tilestream.pipeline.stages.observe import observe_drive
 from tilestream.pipeline.stages.predict import predict
 from tilestream.pipeline.stages.samples import COLUMNS, DatasetFile, samples
 from tilestream.pipeline.stages.train import ModelFile, ModelInUse, train
-from tilestream.settings import RunSettings
 
-OPPONENT = "training median"
-"""Whom a part of the error is judged against: the others know no more of unseen paths."""
+OPPONENT = Median.name
+"""What the estimates of a part of the error are compared with: the others know no more of unseen
+paths."""
 NEIGHBOURS_MM = round(NEIGHBOURS * MM_PER_M) + 1
 """How far from a tile a sample point of it may have neighbours, rounding included [mm]."""
 BESIDE = TOLERANCE + NEIGHBOURS + 1.0
@@ -167,7 +172,7 @@ def _observed_of_drives(
 
 def _model_there(settings: RunSettings) -> tuple[bool, Readable | None]:
     """Whether nothing has to be trained, and the model in use; None: the virtual drive as it is."""
-    if settings.model.recipe == "physics":
+    if settings.model.untrained:
         return True, None
     if settings.model.use is None:
         return False, None
@@ -229,17 +234,20 @@ def _training(settings: RunSettings, joined: Task) -> Task:
 
 
 def _evaluations(settings: RunSettings, joined: Task, observed: bool) -> list[Task]:
-    """Every model and opponent on all factors, the forests on each set of Table IV; the parts of
-    the error by the forest in use, the virtual drive and the training median.
+    """Every model and opponent on all factors; the paper's forest on each set of Table IV, the
+    other regressors on those with all four criteria; the parts of the error by the regressor in
+    use, the virtual drive and the training median.
     """
     folder, model = f"{settings.out}/tables/judged", settings.model
     columns = features_of(COLUMNS if observed else catalogue.COLUMNS)
     *sets, _ = factor_sets(columns)  # the last has all factors, as the competitors have
-    known = [name for name in COMPETITORS if observed or name not in PHYSICS]
-    wanted = [(MAIN, competitor, "") for competitor in known]
-    wanted += [(MAIN, "paper", name) for name in sets]
-    wanted += [(MAIN, "default", name) for name in sets if "LS" in name and "ob" not in name]
-    of_parts = [model.recipe, *(name for name in known if name in PHYSICS), OPPONENT]
+    virtual = [UNTRAINED] if observed else []
+    wanted = [(MAIN, name, "") for name in COMPETITORS if observed or name != UNTRAINED]
+    wanted += [(MAIN, PaperForest.name, name) for name in sets]
+    whole = [name for name in sets if "LS" in name and "ob" not in name]
+    others = [name for name in REGRESSORS if name != PaperForest.name]
+    wanted += [(MAIN, other, name) for other in others for name in whole]
+    of_parts = [model.recipe, *virtual, OPPONENT]
     wanted += [(target, name, "") for target in TARGETS if target != MAIN for name in of_parts]
     tasks = []
     for target, competitor, factor_set in wanted:

@@ -1,14 +1,112 @@
-"""The settings of the main job from a YAML file."""
+"""The settings of the main job, and how a YAML file gives them."""
 
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated, Self
 
 import yaml
-from pydantic import ValidationError
+from pydantic import AfterValidator, Field, ValidationError, model_validator
 
+from tilestream.config import Settings
 from tilestream.errors import SourceNotFoundError, UsageError
-from tilestream.settings import RunSettings
+from tilestream.model.registry import COMPETITORS, DEFAULT, RECIPES, UNTRAINED
+from tilestream.settings import (
+    DriveSettings,
+    LabelSettings,
+    MapSettings,
+    PlaceSettings,
+    ReportSettings,
+    SimulateSettings,
+    VirtualSettings,
+)
+
+
+def _known(recipe: str) -> str:
+    if recipe not in RECIPES:
+        raise ValueError(f"is {recipe!r}: choose from {', '.join(RECIPES)}")
+    return recipe
+
+
+Recipe = Annotated[
+    str,
+    AfterValidator(_known),
+    Field(
+        description="What estimates the error: "
+        + "; ".join(f"`{name}` ({COMPETITORS[name].words})" for name in RECIPES)
+        + f". All but `{UNTRAINED}` are trained on the drives."
+    ),
+]
+"""Name of a regressor."""
+
+
+class ModelSettings(Settings):
+    """How the errors of the measured places become those of all places."""
+
+    recipe: Recipe = DEFAULT
+    offset: Annotated[float, Field(ge=0.0)] = 0.0
+    """With `physics`: what a real scan adds to the error of a virtual one [m]."""
+    use: str | None = None
+    """A model file to use instead of training; null: train on the drives."""
+    seed: int = 0
+    """Seed of all that is random in training."""
+
+    @property
+    def untrained(self) -> bool:
+        """Whether the virtual drive as it is makes the estimates."""
+        return self.recipe == UNTRAINED
+
+
+class RunSettings(PlaceSettings):
+    """The main job: from map and drives to the estimated error of every sample point."""
+
+    out: str
+    """The run directory."""
+    simulate: SimulateSettings | None = None
+    """Simulate a city; null: real files."""
+    map: MapSettings = MapSettings()
+    """The map."""
+    drives: tuple[DriveSettings, ...] = ()
+    """The logs to measure on; empty with `simulate`: its drives."""
+    routes: tuple[str, ...] = ()
+    """Files of routes to estimate along; empty: those of the simulation, or of the drives; without
+    drives, all lanes of a map directory with `lanelet2_map.osm` among the sources."""
+    observe: VirtualSettings | None = VirtualSettings()
+    """How the vehicle's lidar sees in the virtual drive: usable range, blind sector, starts; null:
+    no virtual drive, the paper's factors and their twins only."""
+    label: LabelSettings = LabelSettings()
+    """How errors are measured."""
+    model: ModelSettings = ModelSettings()
+    """How they are estimated."""
+    report: ReportSettings = ReportSettings()
+    """What is reported."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        names = [drive.group for drive in self.drives]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"has two drives named {', '.join(twice)}: give each its own name")
+        if self.simulate is None and not self.map.sources and self.map.store is None:
+            raise ValueError("has no map: give map.sources (files), map.store, or simulate")
+        untrained = self.model.untrained
+        if not (self.simulate or self.drives or self.model.use or untrained):
+            raise ValueError("has nothing to learn from: give drives, simulate, or model.use")
+        if untrained and (self.observe is None or self.model.use):
+            raise ValueError(f"has model.recipe {UNTRAINED}, which needs observe and no model.use")
+        if not (self.simulate or self.drives or self.routes or self.map.sources):
+            raise ValueError("has no routes: give files of routes, or drives")
+        return self
+
+    @property
+    def folder(self) -> Path:
+        """The run directory."""
+        return Path(self.out)
+
+    @property
+    def store_url(self) -> str:
+        """Where the tile store is."""
+        return self.map.store or str(self.folder / "map.zarr")
 
 
 def read_settings(path: str | os.PathLike[str], changes: Sequence[str] = ()) -> RunSettings:
@@ -42,7 +140,7 @@ def read_settings(path: str | os.PathLike[str], changes: Sequence[str] = ()) -> 
 
 
 def _apply(values: dict[str, object], change: str) -> None:
-    """Set one value; levels that are not there are made, and judged with the rest."""
+    """Set one value; levels that are not there are made, and checked with the rest."""
     key, equals, text = change.partition("=")
     if not equals or not key:
         raise UsageError(f"{change!r}: give key=value, e.g. label.matcher=default")

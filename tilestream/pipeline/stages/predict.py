@@ -8,8 +8,9 @@ import pandas as pd
 
 from tilestream.factors.rows import PLACE_COLUMNS
 from tilestream.factors.virtual_drive import physics
-from tilestream.model.reasons import without_training
-from tilestream.model.training import PREDICTION_COLUMNS, Model
+from tilestream.model.explain import without_training
+from tilestream.model.physics import VIRTUAL
+from tilestream.model.training import ESTIMATES, PREDICTION_COLUMNS, Model
 from tilestream.model.training import predict as predicted
 from tilestream.pipeline.engine.outputs import Stored
 from tilestream.pipeline.engine.stage import stage
@@ -58,21 +59,16 @@ def physical(places: pd.DataFrame, offset: float) -> pd.DataFrame:
     `in_domain` are empty. Estimates above `LARGE_ERROR` have a reason.
     """
     good = places["status"] == "done"
-    error = physics(places["vd_mean"].to_numpy(), offset)
     values: dict[str, Any] = {
-        "estimate": error,
-        "p_fail": places["vd_p_fail"],
-        "floor": physics(places["vd_floor"].to_numpy(), offset),
-        "tail": places["vd_tail"],
-        "along": places["vd_along"],
-        "across": places["vd_across"],
-        "up": places["vd_up"],
+        ESTIMATES[target]: places[column] for target, column in VIRTUAL.items()
     }
+    for name in ("estimate", "floor"):
+        values[name] = physics(values[name], offset)
     blank = {c.name: np.nan for c in PREDICTION_COLUMNS if c.dtype == "float64"}
     frame = pd.DataFrame({**blank, **values}, index=places.index)
     frame.loc[~good, list(values)] = np.nan
     reason = places["reason"].astype(object)
-    large = good & (error > LARGE_ERROR)
+    large = good & (frame["estimate"] > LARGE_ERROR)
     reason[large] = without_training(places[large])
     unknown = pd.array([None] * len(places), dtype="boolean")
     words: dict[str, Any] = {"in_domain": unknown, "status": places["status"], "reason": reason}

@@ -13,7 +13,9 @@ from tilestream.factors import catalogue, observability
 from tilestream.factors.rows import PLACE_COLUMNS
 from tilestream.factors.virtual_drive import averaged_along
 from tilestream.marks import Mark
-from tilestream.model.dataset import Dataset, features_of, join
+from tilestream.model.dataset import Dataset
+from tilestream.model.features import features_of
+from tilestream.model.join import join
 from tilestream.pipeline.engine.outputs import Facts, Made, Stored
 from tilestream.pipeline.engine.stage import stage
 from tilestream.pipeline.stages.label import ERROR_COLUMNS
@@ -26,7 +28,8 @@ BYTES_PER_ROW = 10_000
 """Memory per sample point of a joined table: a thousand numbers in several copies."""
 
 MAY_BE_NAN = ("ob_cov_along", "ob_cov_across", "ob_cov_up", "ob_cov_yaw", "vd_median")
-"""What observability has no number for at a place that is lost: the others tell how lost it is."""
+"""Columns of observability that are NaN at some places that have all others; no features, since a
+NaN among the features would leave such a place without an estimate."""
 COLUMNS = (
     *catalogue.COLUMNS,
     *(column for column in observability.COLUMNS if column.name not in MAY_BE_NAN),

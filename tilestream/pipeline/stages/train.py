@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tilestream.errors import ModelError, SourceNotFoundError
 from tilestream.model.dataset import Dataset
-from tilestream.model.model_file import load_model, save_model
+from tilestream.model.file import load_model, save_model
 from tilestream.model.training import Model
 from tilestream.model.training import train as trained
 from tilestream.pipeline.engine.outputs import Facts, Made
@@ -81,5 +81,14 @@ def _model(path: str, state: str) -> Model:  # noqa: ARG001 - other bytes are an
     seconds=80.0,
 )
 def train(dataset: Dataset, recipe: str, seed: int) -> Made:
-    """The model, trained on every drive of every place."""
+    """The model, trained on every drive of every place.
+
+    Args:
+        dataset: what was measured.
+        recipe: name of the regressor.
+        seed: of what is random.
+
+    Raises:
+        ModelError: nothing can be learnt from this dataset; says why.
+    """
     return Made(trained(dataset, recipe=recipe, seed=seed, n_jobs=None), {"rows": len(dataset)})

@@ -1,4 +1,4 @@
-"""Which points train and which judge: the paper's random split, and the honest ones."""
+"""Which points train and which are held out: the paper's random split, and the honest ones."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +12,8 @@ from tilestream.model.dataset import Dataset
 from tilestream.records import Int64
 
 BUFFER = 100.0
-"""Training points this near to a judged one are left out [m]: the range of the paper's vicinity."""
+"""Training points this near to a held-out one are left out [m]: the range of the paper's
+vicinity."""
 FOLDS = 5
 """Parts that the blocks are dealt into."""
 TRAIN_MIN = 20
@@ -28,7 +29,7 @@ class Split:
     train: Int64
     """Rows that train, ascending."""
     test: Int64
-    """Rows that judge, ascending."""
+    """Rows that are held out, ascending."""
 
 
 @dataclass(frozen=True)
@@ -44,14 +45,14 @@ class Protocol:
 
 
 def random_split(dataset: Dataset, seed: int = 0) -> list[Split]:
-    """The paper's: a random quarter of the points judges. It leaks at a spacing of 1 m."""
+    """The paper's: a random quarter of the points is held out. It leaks at a spacing of 1 m."""
     order = np.random.default_rng(seed).permutation(len(dataset))
     cut = len(dataset) - round(0.25 * len(dataset))
     return [Split("random quarter", np.sort(order[:cut]), np.sort(order[cut:]))]
 
 
 def leave_path_out(dataset: Dataset, buffer: float = BUFFER) -> list[Split]:
-    """Each path is judged by the others, without their points within `buffer` [m] of it.
+    """Each path is estimated from the others, without their points within `buffer` [m] of it.
 
     Raises:
         ModelError: a single path, or too few points left to train.
@@ -64,7 +65,7 @@ def leave_path_out(dataset: Dataset, buffer: float = BUFFER) -> list[Split]:
 
 
 def block_splits(dataset: Dataset, folds: int = FOLDS, buffer: float = BUFFER) -> list[Split]:
-    """The blocks are dealt in turn into folds; each fold is judged by the points beyond `buffer`.
+    """The blocks are dealt in turn into folds; each fold is estimated from points beyond `buffer`.
 
     Raises:
         ModelError: a single block, or too few points left to train.

@@ -1,7 +1,7 @@
 """A model is one file: a skops archive of exactly these types, with all that it depends on inside.
 
-Reading one runs nothing from it: types are compared with a list before anything is built, and every
-tree is checked before it is walked, since scikit-learn walks trees without checking.
+Reading one runs nothing from it: types are compared with a list before anything is built, and each
+regressor checks what it is built from (`Regressor.load`).
 """
 
 import io
@@ -17,33 +17,29 @@ import numpy as np
 import sklearn
 import skops
 import skops.io
-from sklearn.ensemble import RandomForestRegressor
 
 from tilestream.errors import ModelError, SourceNotFoundError
 from tilestream.model.domain import Domain
+from tilestream.model.explain import Typical
 from tilestream.model.intervals import Interval
-from tilestream.model.models import Forest
-from tilestream.model.reasons import Typical
+from tilestream.model.registry import REGRESSORS
 from tilestream.model.training import Model
 from tilestream.version import VERSION
 
 FORMAT = "tilestream model"
 FORMAT_VERSION = 2
 """Raise it when a model of an older file would be read wrongly."""
-TRUSTED = ("sklearn.tree._tree.Tree",)
-"""What skops is told to build beyond what it trusts by itself."""
-TYPES = frozenset(
+CONTAINERS = frozenset(
     {
         "builtins.dict",
         "builtins.list",
         "builtins.str",
         "builtins.tuple",
         "numpy.ndarray",
-        "sklearn.ensemble._forest.RandomForestRegressor",
-        "sklearn.tree._classes.DecisionTreeRegressor",
-        *TRUSTED,
     }
 )
+"""What every model file is built of."""
+TYPES = CONTAINERS.union(*(regressor.types for regressor in REGRESSORS.values()))
 """Every type that a model file may name."""
 TYPICAL = ("middle", "below", "above", "rho")
 """The arrays of `Typical`, one number per factor."""
@@ -72,12 +68,11 @@ def save_model(model: Model, path: str | os.PathLike[str]) -> None:
         "threshold": model.domain.threshold,
         "typical": {name: getattr(model.typical, name) for name in ("names", "units", "clear")},
         "worst": model.worst,
-        "log": {target: forest.log for target, forest in model.forests.items()},
         "facts": dict(model.facts),
     }
-    content = {
+    content = {  # "forests" is what version 0.1 calls the regressors
         "facts": json.dumps(facts, sort_keys=True),
-        "forests": {target: forest.trees for target, forest in model.forests.items()},
+        "forests": {target: one.save() for target, one in model.regressors.items()},
         "domain": {
             "middle": model.domain.middle,
             "scale": model.domain.scale,
@@ -104,7 +99,7 @@ def load_model(path: str | os.PathLike[str]) -> Model:
     data = place.read_bytes()
     _refuse_other_types(place, data)
     try:
-        content = skops.io.loads(data, trusted=list(TRUSTED))
+        content = skops.io.loads(data, trusted=sorted(TYPES))
         facts = json.loads(content["facts"])
         _refuse_other_versions(place, facts)
         return _model(content, facts)
@@ -154,16 +149,22 @@ def _refuse_other_versions(place: Path, facts: Mapping[str, Any]) -> None:
     written, here = (v.split(".")[:2] for v in (facts["sklearn"], sklearn.__version__))
     if written != here:
         raise ModelError(
-            f"{place}: its trees are of scikit-learn {facts['sklearn']}, here is "
+            f"{place}: its regressors are of scikit-learn {facts['sklearn']}, here is "
             f"{sklearn.__version__}: train it again, or install that version"
         )
 
 
 def _model(content: Mapping[str, Any], facts: Mapping[str, Any]) -> Model:
     names = tuple(str(name) for name in facts["factors"])
-    forests = {
-        target: Forest(_checked(trees, len(names)), bool(facts["log"][target]))
-        for target, trees in content["forests"].items()
+    recipe, settings = facts["facts"]["recipe"], facts["facts"]
+    if recipe not in REGRESSORS:
+        raise ModelError(
+            f"a model of {recipe!r}, and this tilestream has {', '.join(sorted(REGRESSORS))}: "
+            "train it again"
+        )
+    regressors = {
+        target: REGRESSORS[recipe].load(saved, target, names, settings)
+        for target, saved in content["forests"].items()
     }
     arrays = {name: np.asarray(a, np.float64) for name, a in content["domain"].items()}
     shapes = {"middle": (len(names),), "scale": (len(names),), "whitening": (len(names),) * 2}
@@ -175,7 +176,7 @@ def _model(content: Mapping[str, Any], facts: Mapping[str, Any]) -> Model:
         raise ModelError("a damaged model file: what is typical is not of its factors")
     level, factor, blocks = (facts["interval"][k] for k in ("level", "factor", "blocks"))
     return Model(
-        forests=forests,
+        regressors=regressors,
         domain=Domain(**arrays, threshold=float(facts["threshold"])),
         typical=Typical(known, units, **typical, clear=float(facts["typical"]["clear"])),
         interval=Interval(
@@ -189,32 +190,3 @@ def _model(content: Mapping[str, Any], facts: Mapping[str, Any]) -> Model:
         worst=float(facts["worst"]),
         facts=facts["facts"],
     )
-
-
-def _checked(forest: Any, factors: int) -> RandomForestRegressor:
-    """The forest, if every path through its trees ends and asks for factors that are there.
-
-    Raises:
-        ModelError: a tree that would lead out of its own arrays.
-    """
-    if not isinstance(forest, RandomForestRegressor) or forest.n_features_in_ != factors:
-        raise ModelError("a damaged model file: its forest is not of its factors")
-    for estimator in forest.estimators_:
-        tree = estimator.tree_
-        nodes = np.arange(tree.node_count)
-        left, right = tree.children_left, tree.children_right
-        inner = left >= 0
-        ok = (
-            tree.n_features == factors
-            and tree.value.shape == (tree.node_count, 1, 1)
-            and bool(((left < 0) == (right < 0)).all())
-            # Children come after their parent, so every walk ends.
-            and bool((np.minimum(left, right) > nodes)[inner].all())
-            and bool((np.maximum(left, right) < tree.node_count)[inner].all())
-            and bool(((tree.feature >= 0) & (tree.feature < factors))[inner].all())
-            and bool(np.isfinite(tree.value).all())
-        )
-        if not ok:
-            raise ModelError("a damaged model file: a tree leads nowhere")
-    forest.set_params(n_jobs=1)
-    return forest

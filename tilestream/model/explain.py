@@ -1,4 +1,4 @@
-"""Why an estimate is high, in words: what drives the trees there, and what the map is like."""
+"""Why an estimate is high, in words: what raises it there, and what the map is like."""
 
 import math
 from collections.abc import Hashable, Mapping, Sequence
@@ -8,7 +8,6 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 from scipy.stats import rankdata
-from sklearn.ensemble import RandomForestRegressor
 
 from tilestream.model.phrases import (
     ACROSS,
@@ -25,29 +24,29 @@ from tilestream.model.phrases import (
 from tilestream.records import Column, Float64
 
 CLEAR = 0.15
-"""Least rank correlation with the error [abs] at which a factor of the map has a bad side."""
+"""Least rank correlation with the error [abs] at which one side of a factor counts as bad."""
 ERRORS = 2.0
-"""And that many standard errors of one."""
+"""The correlation must also be this many of its standard errors."""
 PIECE = 20.0
-"""Points within this along a path say the same [m] (the correlation length of definitions,
-section 6)."""
+"""Points within this along a path count as one observation [m] (the correlation length of
+definitions, section 6)."""
 OUT = 1.0
-"""A factor is named as a cause from this far out: beyond the training quartile."""
+"""A factor is named as a cause from this distance on [median to training quartile = 1]."""
 OUT_MOST = 5.0
-"""Farther out counts as this."""
+"""Larger distances count as this."""
 NOTICEABLE = 0.03
-"""And when its value differs from the median by this share of it: factors that hardly vary have
-quartiles that nobody would see."""
+"""A cause also differs from the median by this share of it: the quartiles of a factor that hardly
+varies are too close to notice."""
 
 AXES = {"vd_along": SLIDES_ALONG, "vd_across": SLIDES_ACROSS, "vd_up": SINKS}
-"""What it is called when a virtual drive errs most in a direction."""
+"""The phrase for the direction in which a virtual drive errs most."""
 BOUNDS = (
     ("ob_unmapped", 0.15, 1.0, UNMAPPED),
     ("ob_ghosts", 0.4, 1.0, TRAFFIC),
     ("ob_returns", 0.0, 0.5, UNSEEN),
 )
-"""Shares between which a place is out of the ordinary without any training: fewer than a tenth of
-the places of the simulated Shinjuku are, by each of them."""
+"""Without training, a share between these bounds is unusual: by each of them fewer than a tenth of
+the places of the simulated Shinjuku are."""
 HALF = 0.5
 """A direction that is fixed less than this share of the one across to it is the weak one."""
 SHARES = frozenset(
@@ -56,7 +55,7 @@ SHARES = frozenset(
         *("occupancy_ratio", "loose_share", "ob_returns", "ob_unmapped", "ob_ghosts", "vd_p_fail"),
     }
 )
-"""Factors that are told in percent."""
+"""Factors that are written in percent."""
 UNITS = {
     "1": (1.0, ""),
     "bit": (1.0, " bit"),
@@ -66,7 +65,7 @@ UNITS = {
     "1/m^2": (1.0, " per m²"),
     "1/rad^2": (1.0, " per rad²"),
 }
-"""How a unit is told: times what, and followed by what."""
+"""How a unit is written: the factor that values are multiplied by, and the text behind them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +73,7 @@ class Typical:
     """What factors are at the training places, and on which side of that errors are larger."""
 
     names: tuple[str, ...]
-    """All factors of the dataset, also those that the trees do not ask for."""
+    """All factors of the dataset, also those that the regressor does not read."""
     units: tuple[str, ...]
     """Their units (`Column.unit`)."""
     middle: Float64
@@ -86,12 +85,12 @@ class Typical:
     rho: Float64
     """(f,) rank correlation with the error; 0 for a factor that is the same everywhere."""
     clear: float
-    """From which correlation [abs] on it says on which side a factor is bad: `CLEAR`, and on a
-    short drive more, since anything goes with the error there by chance."""
+    """Least correlation [abs] that says on which side a factor is bad: `CLEAR`, and more on a short
+    drive, where any factor may correlate with the error by chance."""
 
     def out(self, values: Float64) -> Float64:
-        """(n, f) how far values lie above (> 0) or below the median, 1 being the quartile on that
-        side; 0 for no value.
+        """(n, f) how far values lie above (> 0) or below the median; 1 is the quartile on that
+        side, NaN becomes 0.
         """
         away = values - self.middle
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -106,7 +105,7 @@ def typical_of(X: Float64, error: Float64, columns: Sequence[Column], pieces: in
         X: (n, f) their factors.
         error: (n,) their errors.
         columns: the factors.
-        pieces: how many of the places speak for themselves: pieces of `PIECE` along the paths.
+        pieces: how many independent observations the places are: pieces of `PIECE` of the paths.
     """
     low, middle, high = np.percentile(X, [25, 50, 75], axis=0)
     deviation = X.std(axis=0)
@@ -126,29 +125,6 @@ def typical_of(X: Float64, error: Float64, columns: Sequence[Column], pieces: in
     )
 
 
-def contributions(forest: RandomForestRegressor, X: Float64) -> Float64:
-    """(n, f) what each factor adds to each estimate along the paths through the trees.
-
-    On the way from root to leaf, a step changes the mean of the labels at hand; the change belongs
-    to the factor that was asked there (Saabas 2014). The sum over the factors, plus the mean over
-    the roots, is the estimate in the trees' own unit.
-    """
-    total = np.zeros(X.shape)
-    X32 = np.ascontiguousarray(X, np.float32)
-    for estimator in forest.estimators_:
-        tree = estimator.tree_
-        value = tree.value[:, 0, 0]
-        inner = np.flatnonzero(tree.children_left >= 0)
-        change, factor = np.zeros(tree.node_count), np.zeros(tree.node_count, np.int64)
-        for child in (tree.children_left[inner], tree.children_right[inner]):
-            change[child], factor[child] = value[child] - value[inner], tree.feature[inner]
-        paths = tree.decision_path(X32)
-        row = np.repeat(np.arange(len(X)), np.diff(paths.indptr))
-        place = row * X.shape[1] + factor[paths.indices]
-        total += np.bincount(place, change[paths.indices], X.size).reshape(X.shape)
-    return total / len(forest.estimators_)
-
-
 def in_words(
     contribution: Float64, names: Sequence[str], values: Float64, typical: Typical
 ) -> list[str]:
@@ -156,10 +132,10 @@ def in_words(
 
     1. What raises the estimate most and does not sound reassuring (`REASSURING`). Where there is a
        virtual drive it is what that does there.
-    2. What else that the trees ask for raises it most, but for the virtual drive: what a scan would
-       see there.
+    2. What else that the regressor reads raises it most, but for the virtual drive: what a scan
+       would see there.
     3. What of the map's own factors lies farthest out, times how clearly errors go with it (those
-       with which they do not go clearly are left out). The trees need not ask for it.
+       with which they do not go clearly are left out). The regressor need not read it.
 
     A cause, 2 or 3, lies beyond the training quartile, on the side that goes with larger errors and
     noticeably away from the median, and sounds like one. Factors that say the same (the counts are
@@ -167,7 +143,7 @@ def in_words(
     with the factor that weighs most in it, its value there and the median of the training places.
 
     Args:
-        contribution: (n, k) what each factor of the trees adds (`contributions`).
+        contribution: (n, k) what each factor adds (`Regressor.contributions`).
         names: (k,) those factors, each of them in `typical`.
         values: (n, f) the factors of `typical`; NaN where the table has none.
         typical: of the training places.
@@ -222,7 +198,7 @@ def _reason(
 
 def compared(k: int, value: float, typical: Typical, *, named: bool = False) -> str:
     """A factor's value beside the typical one, in units that a person reads: `89 cm, typically
-    5 cm`. After a phrase lengths and shares speak for themselves; others are `named` in any case.
+    5 cm`. Lengths and shares are named only if `named` is set: their unit shows what they are.
     """
     name, middle = typical.names[k], float(typical.middle[k])
     times, unit = UNITS.get(typical.units[k], (1.0, f" {typical.units[k]}"))
@@ -236,7 +212,7 @@ def compared(k: int, value: float, typical: Typical, *, named: bool = False) -> 
 
 
 def _apart(value: float, other: float) -> tuple[str, str]:
-    """Two numbers with as few digits as tell them apart, two at least and five at most."""
+    """Two numbers with as few digits as show that they differ, at least two and at most five."""
     for digits in range(2, 6):
         here, there = (
             np.format_float_positional(x, digits, unique=False, fractional=False, trim="-")

@@ -6,7 +6,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from tilestream.model.dataset import Dataset, join
+from tilestream.model.dataset import Dataset
+from tilestream.model.join import join
 from tilestream.records import Column
 
 Floats = NDArray[np.float64]
@@ -94,4 +95,25 @@ def labels_of(error: Floats) -> dict[str, Floats]:
 def dataset(seed: int = 0, related: float = 0.7, lengths: dict[str, int] | None = None) -> Dataset:
     """The same, joined."""
     factors, labels = drives(seed, lengths, related)
+    return join(factors, {"drive": labels}, COLUMNS)
+
+
+def unrelated(seed: int) -> Dataset:
+    """Labels that follow from no factor: smooth along the road, as the factors are."""
+    found = dataset(seed, 0.0, {"a": 420, "b": 420, "c": 420})
+    return found.with_columns(found.columns[:8])
+
+
+def caused() -> Dataset:
+    """Labels that follow from three factors, which vary fast enough to be learnt in 600 points."""
+    factors, labels = drives(6, {"a": 210, "b": 210, "c": 210})
+    for table in (factors, labels):
+        table["arc_length"] *= 2.0
+        table["x"] += 0.5 * table["arc_length"]
+    rng = np.random.default_rng(6)
+    names = [column.name for column in COLUMNS]
+    values = rng.normal(size=(len(factors), len(names)))
+    factors[names] = values
+    shape = (values[:, 0] - values[:, -1] + values[:, 9]) / np.sqrt(3.0)
+    labels = labels.assign(**labels_of(0.09 * np.exp(0.6 * shape)))
     return join(factors, {"drive": labels}, COLUMNS)
