@@ -15,11 +15,10 @@ from tilestream.errors import UsageError
 from tilestream.factors.observability import (
     COLUMNS,
     hessian_factors,
-    in_view,
     information,
     observability,
 )
-from tilestream.factors.surfels import Surfels, surfels_in
+from tilestream.factors.surfels import Surfels, in_view, surfels_in
 from tilestream.factors.virtual_drive import (
     AVERAGED,
     averaged_along,

@@ -276,13 +276,17 @@ def _setting_entries() -> Iterator[Entry]:
 
 
 def _fields(
-    model: type[Settings], above: tuple[str, ...]
+    model: type[Settings], above: tuple[str, ...], told: Set[type[Settings]] = frozenset()
 ) -> Iterator[tuple[tuple[str, ...], type[Settings], FieldInfo]]:
-    """The fields of settings and of those inside them: levels of the key, class, field."""
+    """The fields of settings and of those inside them: levels of the key, class, field. What a
+    field may hold as it is and in a list is told once.
+    """
     for name, field in model.model_fields.items():
         yield (*above, name), model, field
-        for inner in _settings_in(field.annotation):
-            yield from _fields(inner, (*above, name))
+        inside = list(_settings_in(field.annotation))
+        for inner in inside:
+            if inner not in told:
+                yield from _fields(inner, (*above, name), frozenset(inside))
 
 
 def _settings_in(annotation: Any) -> Iterator[type[Settings]]:

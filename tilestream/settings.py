@@ -1,9 +1,9 @@
 """Every knob of the jobs, once: name, unit, meaning and default.
 
-The YAML file of a job puts them together (`RunSettings` in `pipeline/jobs/run_settings.py`, with the
-choice of the model). The options of the command line are made from these fields (`cli/fields.py`),
-and the keywords of the Python jobs have the same names and defaults (tests/test_settings.py). The
-simulated city has a file of its own (`simulation/settings.py`).
+The YAML file of a job puts them together (`RunSettings` in `pipeline/jobs/run_settings.py`, with
+the choice of the model). The options of the command line are made from these fields
+(`cli/fields.py`), and the keywords of the Python jobs have the same names and defaults
+(tests/test_settings.py). The simulated city has a file of its own (`simulation/settings.py`).
 """
 
 from pathlib import Path

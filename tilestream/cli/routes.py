@@ -41,6 +41,17 @@ from tilestream.settings import (
 )
 from tilestream.store import open_store
 
+Ranges = Annotated[
+    list[str],
+    typer.Option("--range-max", "--range", help="Usable ranges [m], e.g. 30,60; default: all."),
+]
+BlindRears = Annotated[
+    list[str],
+    typer.Option(
+        "--blind-rear-deg", "--blind-rear", help="Blind sectors at the rear [deg], e.g. 0,120."
+    ),
+]
+
 
 @on_cluster
 @with_settings
@@ -167,16 +178,8 @@ def compare(
     cell_size: Annotated[
         list[str], typer.Option(help="Edges of the NDT cells [m], e.g. 1.0,2.0.")
     ] = ["2.0"],  # noqa: B006
-    ranges: Annotated[
-        list[str],
-        typer.Option("--range-max", "--range", help="Usable ranges [m], e.g. 30,60; default: all."),
-    ] = [],  # noqa: B006
-    blind_rear: Annotated[
-        list[str],
-        typer.Option(
-            "--blind-rear-deg", "--blind-rear", help="Blind sectors at the rear [deg], e.g. 0,120."
-        ),
-    ] = ["0"],  # noqa: B006
+    ranges: Ranges = [],  # noqa: B006
+    blind_rear: BlindRears = ["0"],  # noqa: B006
     cap: Annotated[
         float, typer.Option(help="What 95 % of a tile's estimates must stay within [m].")
     ] = 0.15,
@@ -213,6 +216,15 @@ def compare(
             watch=watch,
         )
     content = write_comparison(found, folder, threshold=report.threshold, cap=cap)
+    _show_comparison(content, store, folder, as_json)
+
+
+def _show_comparison(content: dict[str, Any], store: str, folder: str, as_json: bool) -> None:
+    """Print a comparison and where its page is.
+
+    Raises:
+        PartialError: no choice has an estimate anywhere.
+    """
     if as_json:
         print_json(content)
     else:

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from tilestream.errors import RegistrationError, TileNotReadyError, UsageError
 from tilestream.factors import virtual_drive
 from tilestream.factors.ghosts import REACH_EDGES, ghosts_among
-from tilestream.factors.surfels import Surfels, surfel_mm, surfels_in
+from tilestream.factors.surfels import Surfels, in_view, surfel_mm, surfels_in
 from tilestream.factors.table import NO_GROUND, places_of
 from tilestream.factors.virtual_drive import stratified_starts
 from tilestream.factors.virtual_scan import (
@@ -344,35 +344,6 @@ def _schur(L: Float64, kept: list[int]) -> Float64:
         return np.full((len(kept), len(kept)), math.nan)
     rest: Float64 = L[np.ix_(kept, kept)] - L[np.ix_(kept, free)] @ solved
     return rest
-
-
-def in_view(
-    surfels: Surfels,
-    places: Float64,
-    fov_deg: tuple[float, float],
-    reach: float,
-    rim: float = 0.0,
-) -> Surfels:
-    """The surfels that a beam from any of the places can meet, and a few more.
-
-    Args:
-        surfels: the surfels around the places.
-        places: (k, 3) places [m, map frame], best near one another.
-        fov_deg: lowest and highest elevation of the beams [deg].
-        reach: range of the beams [m].
-        rim: how far from its place a beam may start [m].
-    """
-    middle = places.mean(axis=0)
-    around = float(np.hypot(*(places - middle)[:, :2].T).max())
-    offset = surfels.centre_mm / MM_PER_M - middle
-    away = np.hypot(offset[:, 0], offset[:, 1])
-    near, far = np.maximum(away - around - 1.0 - rim, 0.0), away + around + 1.0 + rim
-    low, high = (math.tan(math.radians(min(max(edge, -89.0), 89.0))) for edge in fov_deg)
-    up = (places - middle)[:, 2]
-    bottom, top = up.min() - 1.0 - rim, up.max() + 1.0 + rim
-    floor = bottom + low * (far if low < 0.0 else near)
-    ceiling = top + high * (far if high > 0.0 else near)
-    return surfels.where((near <= reach) & (offset[:, 2] >= floor) & (offset[:, 2] <= ceiling))
 
 
 def tiles_of(places: Float64, store: TileStore) -> Iterator[Int64]:

@@ -5,17 +5,18 @@ small disc in the plane of the points around it, or a ball where they form no pl
 section 4.2).
 """
 
+import math
 from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tilestream.grid import Box, TileKey, whole_mm
+from tilestream.grid import MM_PER_M, Box, TileKey, whole_mm
 from tilestream.kernels.cells import cell_sums
 from tilestream.kernels.depth_image import thin
 from tilestream.kernels.surfels import surfels_of
-from tilestream.records import Int64
+from tilestream.records import Float64, Int64
 from tilestream.store import Tile, TileStore, TileTable
 
 SURFELS_VERSION = 1
@@ -115,3 +116,32 @@ def surfels_in(store: TileStore, box: Box) -> Surfels:
 
 
 _NONE = Surfels(np.zeros((0, 3), np.int64), np.zeros((0, 3), np.int16), np.zeros(0, np.int32))
+
+
+def in_view(
+    surfels: Surfels,
+    places: Float64,
+    fov_deg: tuple[float, float],
+    reach: float,
+    rim: float = 0.0,
+) -> Surfels:
+    """The surfels that a beam from any of the places can meet, and a few more.
+
+    Args:
+        surfels: the surfels around the places.
+        places: (k, 3) places [m, map frame], best near one another.
+        fov_deg: lowest and highest elevation of the beams [deg].
+        reach: range of the beams [m].
+        rim: how far from its place a beam may start [m].
+    """
+    middle = places.mean(axis=0)
+    around = float(np.hypot(*(places - middle)[:, :2].T).max())
+    offset = surfels.centre_mm / MM_PER_M - middle
+    away = np.hypot(offset[:, 0], offset[:, 1])
+    near, far = np.maximum(away - around - 1.0 - rim, 0.0), away + around + 1.0 + rim
+    low, high = (math.tan(math.radians(min(max(edge, -89.0), 89.0))) for edge in fov_deg)
+    up = (places - middle)[:, 2]
+    bottom, top = up.min() - 1.0 - rim, up.max() + 1.0 + rim
+    floor = bottom + low * (far if low < 0.0 else near)
+    ceiling = top + high * (far if high > 0.0 else near)
+    return surfels.where((near <= reach) & (offset[:, 2] >= floor) & (offset[:, 2] <= ceiling))
