@@ -251,10 +251,9 @@ def test_times_that_make_no_sense_are_no_times(values: np.ndarray, tmp_path: Pat
     ],
 )
 def test_poses_of_every_type(kind: str, make: Any, tmp_path: Path) -> None:
-    points = logs.street_points(np.random.default_rng(0))
     times = [START + i * SECOND // 10 for i in range(5)]
     messages = [(t, "/where", kind, make(t, pose(x=t % 7, yaw=0.3))) for t in times]
-    path = logs.write(tmp_path / "a.mcap", [*messages, *(logs.cloud_at(t, points) for t in times)])
+    path = logs.write(tmp_path / "a.mcap", [*messages, *(logs.cloud_at(t) for t in times)])
     log = open_log(path)
     assert log.pose_topic == "/where"
     assert log.posed.all()
@@ -266,15 +265,13 @@ def test_static_transforms_lead_from_the_vehicle_to_the_lidar(tmp_path: Path) ->
     T_base_mast, T_mast_lidar = pose(x=1.0, z=1.5, yaw=0.2), pose(y=0.3, z=0.4, yaw=-0.1)
     T_map_base = pose(x=100.0, y=50.0, yaw=1.0)
     T_lidar_mast = np.linalg.inv(T_mast_lidar)  # recorded against the direction of the chain
-    tf = "tf2_msgs/msg/TFMessage"
-    points = logs.street_points(np.random.default_rng(0))
     path = logs.write(
         tmp_path / "a.mcap",
         [
-            (START, "/tf_static", tf, logs.transform(0, "base", "mast", T_base_mast)),
-            (START, "/tf_static", tf, logs.transform(0, "lidar", "mast", T_lidar_mast)),
+            logs.static_tf("base", "mast", T_base_mast),
+            logs.static_tf("lidar", "mast", T_lidar_mast),
             logs.odometry_at(START, T_map_base, child="base"),
-            logs.cloud_at(START, points),
+            logs.cloud_at(START),
         ],
     )
     log = open_log(path)
@@ -284,16 +281,14 @@ def test_static_transforms_lead_from_the_vehicle_to_the_lidar(tmp_path: Path) ->
 
 
 def test_tf_composes_moving_and_static_transforms(tmp_path: Path) -> None:
-    tf = "tf2_msgs/msg/TFMessage"
-    points = logs.street_points(np.random.default_rng(0))
-    messages = [(START, "/tf_static", tf, logs.transform(0, "base", "lidar", pose(z=2.0, yaw=0.5)))]
+    messages = [logs.static_tf("base", "lidar", pose(z=2.0, yaw=0.5))]
     for i in range(0, 11, 2):  # 5 Hz
         t = START + i * SECOND // 10
-        messages.append((t, "/tf", tf, logs.transform(t, "map", "odom", pose(x=10.0, y=0.1 * i))))
+        messages.append(logs.tf_at(t, "map", "odom", pose(x=10.0, y=0.1 * i)))
     for i in range(1, 9):  # 10 Hz, starts later, ends earlier
         t = START + i * SECOND // 10
-        messages.append((t, "/tf", tf, logs.transform(t, "odom", "base", pose(x=float(i)))))
-    messages += [logs.cloud_at(START + i * SECOND // 10, points) for i in range(11)]
+        messages.append(logs.tf_at(t, "odom", "base", pose(x=float(i))))
+    messages += [logs.cloud_at(START + i * SECOND // 10) for i in range(11)]
     log = open_log(logs.write(tmp_path / "a.mcap", messages))
     before, after = PoseStatus.BEFORE, PoseStatus.AFTER
     assert log.pose_status.tolist() == [before, *[PoseStatus.POSED] * 8, after, after]
@@ -303,14 +298,13 @@ def test_tf_composes_moving_and_static_transforms(tmp_path: Path) -> None:
 
 
 def test_a_pose_without_a_frame_is_taken_as_the_lidars_and_it_says_so(tmp_path: Path) -> None:
-    points = logs.street_points(np.random.default_rng(0))
-    tf, posed = "tf2_msgs/msg/TFMessage", "geometry_msgs/msg/PoseStamped"
+    posed = "geometry_msgs/msg/PoseStamped"
     path = logs.write(
         tmp_path / "a.mcap",
         [
-            (START, "/tf_static", tf, logs.transform(0, "base", "lidar", pose(z=2.0))),
+            logs.static_tf("base", "lidar", pose(z=2.0)),
             (START, "/pose", posed, logs.pose_stamped(START, pose(x=5.0))),
-            logs.cloud_at(START, points),
+            logs.cloud_at(START),
         ],
     )
     log = open_log(path)
@@ -321,13 +315,12 @@ def test_a_pose_without_a_frame_is_taken_as_the_lidars_and_it_says_so(tmp_path: 
 
 
 def test_poses_in_the_map_go_before_others_however_many(tmp_path: Path) -> None:
-    points = logs.street_points(np.random.default_rng(0))
     path = logs.write(
         tmp_path / "a.mcap",
         [
             *(logs.odometry_at(START + i, pose(), "/wheels", frame="odom") for i in range(5)),
             logs.odometry_at(START, pose(x=5.0), "/localization"),
-            logs.cloud_at(START, points),
+            logs.cloud_at(START),
         ],
     )
     log = open_log(path)
@@ -337,12 +330,11 @@ def test_poses_in_the_map_go_before_others_however_many(tmp_path: Path) -> None:
 
 
 def test_the_topic_with_the_most_clouds_is_taken_and_noted(tmp_path: Path) -> None:
-    points = logs.street_points(np.random.default_rng(0))
     messages = [
         logs.odometry_at(START, pose()),
-        logs.cloud_at(START, points, "/map_cloud"),
-        logs.cloud_at(START, points),
-        logs.cloud_at(START, points),
+        logs.cloud_at(START, topic="/map_cloud"),
+        logs.cloud_at(START),
+        logs.cloud_at(START),
     ]
     log = open_log(logs.write(tmp_path / "a.mcap", messages))
     assert log.points_topic == "/points"
