@@ -85,15 +85,9 @@ def pose_with_covariance(stamp_ns: int, T: np.ndarray, frame: str = "map") -> An
 
 def transform(stamp_ns: int, parent: str, child: str, T: np.ndarray) -> Any:
     parts = pose_fields(T)
-    return {
-        "transforms": [
-            {
-                "header": header(stamp_ns, parent),
-                "child_frame_id": child,
-                "transform": {"translation": parts["position"], "rotation": parts["orientation"]},
-            }
-        ]
-    }
+    moved = {"translation": parts["position"], "rotation": parts["orientation"]}
+    stamped = {"header": header(stamp_ns, parent), "child_frame_id": child, "transform": moved}
+    return {"transforms": [stamped]}
 
 
 def cloud(stamp_ns: int, rows: np.ndarray, frame: str = "lidar", **changes: Any) -> Any:
@@ -135,13 +129,27 @@ Message = tuple[int, str, str, Any]
 """Time of recording, topic, type, fields."""
 
 
-def cloud_at(stamp_ns: int, points: np.ndarray, topic: str = "/points", **kwargs: Any) -> Message:
+STREET = np.random.default_rng(0).uniform([-30, -20, -2], [30, 20, 6], (200, 3)).astype("<f4")
+"""Points around a lidar, where it does not matter which."""
+
+
+def cloud_at(
+    stamp_ns: int, points: np.ndarray = STREET, topic: str = "/points", **kwargs: Any
+) -> Message:
     rows = xyz_rows(points)
     return stamp_ns, topic, "sensor_msgs/msg/PointCloud2", cloud(stamp_ns, rows, **kwargs)
 
 
 def odometry_at(stamp_ns: int, T: np.ndarray, topic: str = "/odometry", **kw: Any) -> Message:
     return stamp_ns, topic, "nav_msgs/msg/Odometry", odometry(stamp_ns, T, **kw)
+
+
+def tf_at(stamp_ns: int, parent: str, child: str, T: np.ndarray, topic: str = "/tf") -> Message:
+    return stamp_ns, topic, "tf2_msgs/msg/TFMessage", transform(stamp_ns, parent, child, T)
+
+
+def static_tf(parent: str, child: str, T: np.ndarray) -> Message:
+    return START, "/tf_static", "tf2_msgs/msg/TFMessage", transform(0, parent, child, T)
 
 
 def write(path: Path, messages: list[Message], chunk_size: int = 4096) -> Path:

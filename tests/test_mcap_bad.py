@@ -195,15 +195,9 @@ def test_without_clouds_the_topics_that_are_there_are_named(tmp_path: Path) -> N
 
 
 def test_without_poses(tmp_path: Path) -> None:
-    points = logs.street_points(np.random.default_rng(0))
-    static = (
-        START,
-        "/tf_static",
-        "tf2_msgs/msg/TFMessage",
-        logs.transform(0, "base", "lidar", pose()),
-    )
+    static = logs.static_tf("base", "lidar", pose())
     for messages in ([], [static]):
-        path = logs.write(tmp_path / f"{len(messages)}.mcap", [*messages, logs.cloud_at(1, points)])
+        path = logs.write(tmp_path / f"{len(messages)}.mcap", [*messages, logs.cloud_at(1)])
         with pytest.raises(PoseError, match="no poses"):
             open_log(path)
         with pytest.raises(PoseError, match=r"no poses on topic /odom.*/points"):
@@ -211,14 +205,13 @@ def test_without_poses(tmp_path: Path) -> None:
 
 
 def test_poses_that_are_no_poses(tmp_path: Path) -> None:
-    points = logs.street_points(np.random.default_rng(0))
     nan, flat = pose(x=np.nan), logs.odometry(START + 1, pose())
     flat["pose"]["pose"]["orientation"] = dict.fromkeys("xyzw", 0.0)
     bad = [
         logs.odometry_at(START, nan),
         (START + 1, "/odometry", "nav_msgs/msg/Odometry", flat),
     ]
-    cloud = logs.cloud_at(START + 2, points)
+    cloud = logs.cloud_at(START + 2)
     path = logs.write(tmp_path / "all.mcap", [*bad, cloud])
     with pytest.raises(PoseError, match="none of the 2 poses of /odometry is usable"):
         open_log(path)
@@ -229,21 +222,19 @@ def test_poses_that_are_no_poses(tmp_path: Path) -> None:
 
 
 def test_tf_that_does_not_lead_to_the_lidar(tmp_path: Path) -> None:
-    points = logs.street_points(np.random.default_rng(0))
-    tf = (START, "/tf", "tf2_msgs/msg/TFMessage", logs.transform(START, "map", "base", pose()))
-    path = logs.write(tmp_path / "a.mcap", [tf, logs.cloud_at(START, points)])
+    tf = logs.tf_at(START, "map", "base", pose())
+    path = logs.write(tmp_path / "a.mcap", [tf, logs.cloud_at(START)])
     with pytest.raises(PoseError, match=r"does not lead from 'map'.*'lidar'.*base, map"):
         open_log(path)
 
 
 def test_poses_of_several_frames_on_one_topic(tmp_path: Path) -> None:
-    points = logs.street_points(np.random.default_rng(0))
     path = logs.write(
         tmp_path / "a.mcap",
         [
             logs.odometry_at(START, pose()),
             logs.odometry_at(START + 1, pose(), child="trailer"),
-            logs.cloud_at(START, points),
+            logs.cloud_at(START),
         ],
     )
     with pytest.raises(PoseError, match=r"map -> lidar, map -> trailer"):

@@ -1,11 +1,12 @@
 """PLY, ascii and binary of either byte order: the vertices are the points.
 
-Why not plyfile, against which the tests read: it maps a binary file into memory, as fast as this
-(0.1 s of 0.1 s for 5 M points), but a file that is cut while it is mapped ends the process (bus
-error). Text, and all faces of a mesh, it reads row by row in Python: 8.5 s for 1 M points as text
-(here 1.6 s), 7 s for 1 M faces that no point needs (here none). It has no pieces of text in bounded
-memory, takes a last number that may be cut short and leaves rows over without a word. And it is
-under the GPL, which this package is not. The price is this file, some 200 lines.
+Why not plyfile, with which the tests write: a binary file it maps into memory, as fast as this
+reads it (5 M points of 145 MB: 0.05 s of CPU and 147 MB resident; here 0.10 s and 17 MB), but a
+file that is cut while it is mapped ends the process (bus error). Text, and all faces of a mesh, it
+reads row by row in Python: 8.5 s for 1 M points as text (here 1.6), 7 s for 1 M faces (here they
+are passed over). It has no blocks of text, and takes a last number that may be cut short, or rows
+left over, without a word. It is under the GPL, which this package is not. The price is this file,
+200 lines.
 """
 
 import os

@@ -63,11 +63,8 @@ def read_routes(
     Points that repeat the last one within 1 cm are dropped and counted. A path that turns back is
     kept, the heading follows it. The order of a file's routes is the file's.
 
-    Degrees: coordinates are taken for degrees where the file says so, or where all fit longitude
-    and latitude and either the whole file extends over less than 1 unit, or (in drawn routes; poses
-    are recorded many times a second, also while a vehicle stands) half of the steps are shorter
-    than 0.001 units. In metres that would be a route of less than 1 m, or one drawn every
-    millimetre. Degrees are refused unless `project_to` says where to.
+    Coordinates in degrees (how they are told: `degrees.metric`) are refused unless `project_to`
+    says where to.
 
     Args:
         path: the file.
@@ -87,28 +84,18 @@ def read_routes(
         CrsError: degrees without `project_to`, or a CRS that cannot be used.
     """
     name = str(path)
-    if not is_log(name) and not Path(name).is_file():
-        raise SourceNotFoundError(f"{name}: no such file; check the path")
-    ending = Path(name).suffix.lower()
-    if is_log(name):
-        paths = [_log_path(name, pose_topic)]
-    elif ending in READERS:
-        paths = READERS[ending](name)
-    else:
-        known = ", ".join([*READERS, *map(str, LOG_FORMATS)])
-        raise UnknownFormatError(f"{name}: the ending {ending!r} is of no route; known are {known}")
+    paths = _paths(name, pose_topic)
     if not paths:
         raise CorruptSourceError(f"{name}: holds no route")
     crs = crs or paths[0].crs
-    drawn = READERS.get(ending, read_poses) is not read_poses
+    drawn = READERS.get(Path(name).suffix.lower(), read_poses) is not read_poses
     points = metric(name, [p.positions for p in paths], crs, project_to, drawn)
-    crs = project_to or crs
     lift = z_offset or (np.nan if is_log(name) and z_offset is None else 0.0)
     return [
         route_of(
             p.route_id,
             xyz + np.array([0.0, 0.0, lift]),
-            crs=crs,
+            crs=project_to or crs,
             max_jump=max_jump,
             where=f"{name}: route {p.route_id}",
         )
@@ -147,6 +134,15 @@ def read_route(
     return chosen[0]
 
 
-def _log_path(path: str, pose_topic: str | None) -> Path3:
-    poses = open_log(path, pose_topic=pose_topic).trajectory
-    return Path3(Path(path).stem, poses.T_map_lidar[:, :3, 3].copy())
+def _paths(path: str, pose_topic: str | None) -> list[Path3]:
+    """The paths that a file draws, in its own coordinates."""
+    ending = Path(path).suffix.lower()
+    if is_log(path):
+        poses = open_log(path, pose_topic=pose_topic).trajectory
+        return [Path3(Path(path).stem, poses.T_map_lidar[:, :3, 3].copy())]
+    if not Path(path).is_file():
+        raise SourceNotFoundError(f"{path}: no such file; check the path")
+    if ending not in READERS:
+        known = ", ".join([*READERS, *map(str, LOG_FORMATS)])
+        raise UnknownFormatError(f"{path}: the ending {ending!r} is of no route; known are {known}")
+    return READERS[ending](path)

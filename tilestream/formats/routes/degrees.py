@@ -14,6 +14,11 @@ def metric(
 ) -> list[Float64]:
     """The points of each path of a file in metres: as they are, or projected from degrees.
 
+    Coordinates are taken for degrees where the file says so, or where all fit longitude and
+    latitude and either the whole file extends over less than 1 unit, or (in drawn routes; poses are
+    recorded many times a second, also while a vehicle stands) half of the steps are shorter than
+    0.001 units. In metres that would be a route of less than 1 m, or one drawn every millimetre.
+
     Args:
         path: the file, for messages.
         points: (n, 3) points of each path, as the file gives them.
