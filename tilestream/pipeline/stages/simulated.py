@@ -143,7 +143,7 @@ def scan(city: City, street: str, stretch: tuple[int, int], scans_per_point: int
     return scans_of(city, city.street(street), stretch, scans_per_point)
 
 
-@stage("log", version=1, memory=lambda _: SCENE_BYTES, seconds=0.02)
+@stage("log", version=2, memory=lambda _: SCENE_BYTES, seconds=0.02)
 def log(
     city: City, parts: Sequence[Iterator[Scan]], street: str, end: int, scans_per_point: int
 ) -> Made:
