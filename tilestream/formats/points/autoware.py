@@ -47,7 +47,6 @@ class MapDirectory:
             format="autoware divided map",
             size_bytes=sum(part.summary.size_bytes for part in self._parts),
             points=self._starts[-1],
-            bounds=None,
             fields=tuple(
                 dict.fromkeys(field for part in self._parts for field in part.summary.fields)
             ),
