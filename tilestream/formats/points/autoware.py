@@ -28,7 +28,7 @@ class MapDirectory:
     files: tuple[str, ...]
     """The PCD files that the metadata lists, sorted."""
     crs: str | None
-    """CRS of x and y, where `map_projector_info.yaml` truly tells one."""
+    """CRS of x and y, where `map_projector_info.yaml` tells one."""
     notes: tuple[str, ...]
     """What else a user should know: size of the parts, projector, files that are not listed."""
 
