@@ -42,7 +42,7 @@ from street_tiles import drive, long_street
 
 import tilestream as ts
 from tilestream.formats import open_source
-from tilestream.formats.logs.mcap_write import write_log
+from tilestream.formats.logs import write_log
 from tilestream.formats.points.las import write_las
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.records import Scan, Trajectory

@@ -7,7 +7,7 @@ from typing import Protocol
 from tilestream.records import Float64
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SourceInfo:
     """What is in a file of points, as far as its header (or, where cheap, its content) tells."""
 
@@ -19,13 +19,13 @@ class SourceInfo:
     """Size of the file [bytes]."""
     points: int | None
     """Number of points that the file holds; None where only reading it whole can tell."""
-    bounds: tuple[tuple[float, float, float], tuple[float, float, float]] | None
+    bounds: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
     """Lowest and highest x, y, z [m, map frame], where the header tells; else None."""
     fields: tuple[tuple[str, str], ...]
     """Name and type of each field of a point, as the file names them, e.g. `("x", "float32")`."""
-    crs: str | None
+    crs: str | None = None
     """Coordinate reference system as WKT or an authority code; None where the file has none."""
-    resident_bytes: int
+    resident_bytes: int = 0
     """What a reader must hold at once besides a block [bytes]: 0 where it reads in blocks, the
     size of the decoded content for a format that only opens whole."""
     notes: tuple[str, ...] = ()

@@ -55,7 +55,7 @@ def crs_beside(path: Path) -> tuple[str | None, tuple[str, ...]]:
 
 
 def read_projector(path: Path) -> tuple[str | None, tuple[str, ...]]:
-    """CRS of the map's x and y as a PROJ string where the file truly tells one, and a note.
+    """CRS of the map's x and y as a PROJ string where the file tells one, and a note.
 
     MGRS coordinates count from the corner of a 100 km square of UTM, LocalCartesianUTM ones from an
     origin in UTM, TransverseMercator ones from an origin on its own central meridian: all three

@@ -70,7 +70,8 @@ class McapFile(AbstractContextManager["McapFile"]):
 
     Args:
         path: the file, which begins with `MAGIC`.
-        topics: False leaves out what only `unpack` does not need: summary and topics.
+        topics: whether summary and topics are read; False for a file of which only known records
+            are unpacked.
 
     Raises:
         OSError: there is no such file.

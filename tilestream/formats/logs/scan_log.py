@@ -79,9 +79,7 @@ class ScanLog(Recording):
             format=self.format,
             size_bytes=self.size_bytes,
             points=int(self.point_counts[posed].sum()),
-            bounds=None,
             fields=self.fields,
-            crs=None,
             resident_bytes=int(self.held_bytes[used].max(initial=0))
             + _BYTES_PER_POINT * largest_scan,
             notes=(

@@ -25,16 +25,12 @@ class MapDirectory:
 
     path: str
     """The directory, as it was named."""
-    resolution: tuple[float, float]
-    """Size of a part in x and y [m]."""
     files: tuple[str, ...]
     """The PCD files that the metadata lists, sorted."""
-    corners: tuple[tuple[float, float], ...]
-    """Lowest x, y of the part in each file [m], as the metadata tells it."""
     crs: str | None
-    """CRS of x and y, where `map_projector_info.yaml` truly tells one."""
+    """CRS of x and y, where `map_projector_info.yaml` tells one."""
     notes: tuple[str, ...]
-    """What else a user should know: projector, files that are not listed."""
+    """What else a user should know: size of the parts, projector, files that are not listed."""
 
     @cached_property
     def _parts(self) -> tuple[RowSource, ...]:
@@ -51,7 +47,6 @@ class MapDirectory:
             format="autoware divided map",
             size_bytes=sum(part.summary.size_bytes for part in self._parts),
             points=self._starts[-1],
-            bounds=None,
             fields=tuple(
                 dict.fromkeys(field for part in self._parts for field in part.summary.fields)
             ),
@@ -88,26 +83,22 @@ def open_map_directory(path: str) -> MapDirectory:
     folder = Path(path)
     metadata = folder / METADATA
     content = read_yaml(metadata)
-    resolution = (
-        _resolution(content.pop("x_resolution", None), "x_resolution", metadata),
-        _resolution(content.pop("y_resolution", None), "y_resolution", metadata),
+    width, height = (
+        _length(content.pop(name, None), name, metadata)
+        for name in ("x_resolution", "y_resolution")
     )
-    corners = {
-        _file(folder, name, metadata): _corner(name, corner, metadata)
-        for name, corner in content.items()
-    }
-    _refuse_missing(corners, metadata)
+    for name, corner in content.items():
+        _check_corner(name, corner, metadata)
+    files = sorted({_file(folder, name, metadata) for name in content})
+    _refuse_missing(files, metadata)
     projector = folder / PROJECTOR
     crs, notes = read_projector(projector) if projector.is_file() else (None, ())
-    files = sorted(corners)
     return MapDirectory(
         path=path,
-        resolution=resolution,
         files=tuple(map(str, files)),
-        corners=tuple(corners[file] for file in files),
         crs=crs,
         notes=(
-            f"{len(files)} parts of {resolution[0]:g} x {resolution[1]:g} m",
+            f"{len(files)} parts of {width:g} x {height:g} m",
             *notes,
             *_unlisted(folder, set(files)),
         ),
@@ -122,7 +113,7 @@ FORMAT = Format(
 )
 
 
-def _resolution(value: Any, name: str, metadata: Path) -> float:
+def _length(value: Any, name: str, metadata: Path) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < math.inf:
         raise CorruptSourceError(f"{metadata}: {name} is {value!r}, not a length in metres")
     return float(value)
@@ -143,14 +134,15 @@ def _file(folder: Path, name: Any, metadata: Path) -> Path:
     return file
 
 
-def _corner(name: Any, corner: Any, metadata: Path) -> tuple[float, float]:
+def _check_corner(name: Any, corner: Any, metadata: Path) -> None:
+    """Refuse an entry that does not say where its part lies: lowest x and y [m]."""
     match corner:
         case [int() | float() as x, int() | float() as y] if math.isfinite(x) and math.isfinite(y):
-            return float(x), float(y)
+            return
     raise CorruptSourceError(f"{metadata}: entry {name!r} has {corner!r}, not its corner [x, y]")
 
 
-def _refuse_missing(files: dict[Path, tuple[float, float]], metadata: Path) -> None:
+def _refuse_missing(files: list[Path], metadata: Path) -> None:
     missing = sorted(file.name for file in files if not file.is_file())
     if missing:
         more = f" and {len(missing) - 5} more" if len(missing) > 5 else ""

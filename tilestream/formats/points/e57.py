@@ -124,10 +124,8 @@ def open_e57(path: str) -> RowSource:
         format="e57",
         size_bytes=size_bytes,
         points=found.count,
-        bounds=None,
         fields=tuple((name, "number") for name in names),
         crs=crs,
-        resident_bytes=0,
         notes=notes,
     )
     return RowSource(summary, found)

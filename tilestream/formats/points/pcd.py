@@ -135,7 +135,6 @@ def open_pcd(path: str) -> RowSource:
         format=f"pcd {encoding}",
         size_bytes=size_bytes,
         points=layout.count,
-        bounds=None,
         fields=layout.fields,
         crs=crs,
         resident_bytes=resident,

@@ -107,10 +107,7 @@ def open_ply(path: str) -> RowSource:
         format=f"ply {encoding}",
         size_bytes=size_bytes,
         points=vertex.count,
-        bounds=None,
         fields=tuple((p.name, p.dtype.name) for p in vertex.properties),
-        crs=None,
-        resident_bytes=0,
         notes=tuple(f"element {other.name!r} ({other.count} rows) is ignored" for other in others),
     )
     return RowSource(summary, rows)
