@@ -12,6 +12,7 @@ import tilestream as ts
 from tilestream.factors.virtual_drive import AVERAGED, averaged_along
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.formats.routes import read_routes
+from tilestream.pipeline.jobs.run_findings import labels_of
 from tilestream.pipeline.jobs.run_inputs import degraded_drives, inputs_of, observing_of
 from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
 from tilestream.pipeline.jobs.run_settings import RunSettings
@@ -92,11 +93,23 @@ def test_its_labels_are_joined_with_that_and_the_estimate_is_of_the_vehicle(
         np.testing.assert_array_equal(joined[names], mine[names])
     places = pd.read_parquet(run.folder / "report" / "places.parquet").set_index(KEYS)
     vehicle = averaged_along(usual).set_index(KEYS)["vd_mean"] + OFFSET
-    np.testing.assert_array_equal(
-        places.set_index(KEYS)["estimate"], vehicle[places.set_index(KEYS).index]
-    )
+    np.testing.assert_array_equal(places["estimate"], vehicle[places.index])
     report = json.loads((run.folder / "report" / "report.json").read_text())
     assert any("read as: short;" in note for note in report["facts"]["notes"])
+
+
+@pytest.mark.parametrize("offset", [OFFSET, None])
+def test_no_estimate_of_the_vehicle_stands_beside_its_labels(
+    run: RunSettings, offset: float | None
+) -> None:
+    places = pd.read_parquet(run.folder / "report" / "places.parquet")
+    found = labels_of(ts.dataset(run.folder), places, None, ["short"], offset).set_index("group")
+    short, whole = found.loc["short"], found.loc["whole"]
+    if offset is None:  # a model that was trained elsewhere, for the vehicle
+        assert short["held_out"].isna().all()
+    else:
+        np.testing.assert_array_equal(short["held_out"], short["vd_mean"] + OFFSET)
+    np.testing.assert_array_equal(whole["held_out"], whole["vd_mean"] + OFFSET)
 
 
 def test_a_job_without_degraded_drives_stays_as_it_is(run: RunSettings) -> None:
