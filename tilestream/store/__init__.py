@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 from tilestream.errors import StoreError, StoreVersionError, TileNotReadyError, UsageError
 from tilestream.grid import MM_PER_M, Box, TileGrid, TileKey, whole_mm
 from tilestream.marks import Mark
-from tilestream.ndt import cells_of_mm
 from tilestream.records import Cells, Float64, Int64
 from tilestream.store.arrays import (
     Files,
@@ -36,15 +35,15 @@ from tilestream.store.arrays import (
     write_columns,
     write_root,
 )
+from tilestream.store.table import CELLS_VERSION as CELLS_VERSION
 from tilestream.store.table import TileTable as TileTable
+from tilestream.store.table import cells_table as cells_table
 from tilestream.version import VERSION
 
 SCHEMA = 2
 """Version of the store's layout; a store with another one is refused."""
 POINTS = "points"
 """Name of the table that ingest writes: the column `xyz`."""
-CELLS_VERSION = 1
-"""Raise it when the cells that are made from the same points change."""
 
 
 @dataclass(frozen=True)
@@ -365,24 +364,6 @@ class TileStore:
         more = f"<p>… and {len(rows) - 20} more tiles</p>" if len(rows) > 20 else ""
         body = "".join(f"<tr>{row}</tr>" for row in cells)
         return f"<p>{html.escape(repr(self))}</p><table>{head}{body}</table>{more}"
-
-
-def cells_table(cell_mm: int) -> TileTable:
-    """The cells of one size: the columns of `Cells`."""
-    return TileTable(
-        name=f"cells_{cell_mm}",
-        stage="cells",
-        version=CELLS_VERSION,
-        takes={"cell_mm": cell_mm},
-        reach_mm=0,
-        make=lambda store, key: _cell_columns(store, key, cell_mm),
-    )
-
-
-def _cell_columns(store: TileStore, key: TileKey, cell_mm: int) -> dict[str, NDArray[Any]]:
-    cells = cells_of_mm(store.tile(key).points_mm(), cell_mm)
-    columns = ("index", "count", "mean", "covariance")
-    return {name: getattr(cells, name) for name in columns}
 
 
 def open_store(url: str) -> TileStore:

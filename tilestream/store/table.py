@@ -8,6 +8,10 @@ from numpy.typing import NDArray
 
 from tilestream.grid import TileGrid, TileKey
 from tilestream.marks import hash_of, identity_of
+from tilestream.ndt import cells_of_mm
+
+CELLS_VERSION = 1
+"""Raise it when the cells that are made from the same points change."""
 
 
 @dataclass(frozen=True)
@@ -55,3 +59,21 @@ class TileTable:
             inputs = [(str(k), below.identity(grid, k, have)) for k in near]
         takes = {**self.takes, "tile": key}
         return identity_of(self.stage, self.version, takes, {"map_part": [hash_of(inputs)]})
+
+
+def cells_table(cell_mm: int) -> TileTable:
+    """The cells of one size: the columns of `Cells`."""
+    return TileTable(
+        name=f"cells_{cell_mm}",
+        stage="cells",
+        version=CELLS_VERSION,
+        takes={"cell_mm": cell_mm},
+        reach_mm=0,
+        make=lambda store, key: _cell_columns(store, key, cell_mm),
+    )
+
+
+def _cell_columns(store: Any, key: TileKey, cell_mm: int) -> dict[str, NDArray[Any]]:
+    cells = cells_of_mm(store.tile(key).points_mm(), cell_mm)
+    columns = ("index", "count", "mean", "covariance")
+    return {name: getattr(cells, name) for name in columns}

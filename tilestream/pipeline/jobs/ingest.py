@@ -6,11 +6,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import pyproj
-import pyproj.exceptions
-
 from tilestream.errors import (
-    CrsError,
     PartialError,
     SourceError,
     SourceNotFoundError,
@@ -27,6 +23,7 @@ from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.outputs import TileArrays
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan
 from tilestream.pipeline.engine.stage import Task
+from tilestream.pipeline.jobs.map_crs import one_crs
 from tilestream.pipeline.stages.merge import merge, merge_tasks
 from tilestream.pipeline.stages.scatter import Fragment, SourceSpan, scatter, scatter_tasks
 from tilestream.settings import IngestSettings
@@ -330,38 +327,9 @@ def _examine(path: str, options: dict[str, Any]) -> Source:
 
 
 def _with_crs(settings: IngestSettings, found: Sequence[Source]) -> IngestSettings:
-    """The settings with the one CRS of the map.
-
-    Raises:
-        CrsError: there are two, named with their sources, or one that pyproj cannot read.
-    """
-    named = [(s.path, s.info.crs) for s in found if s.info is not None and s.info.crs]
-    if settings.crs is not None:
-        named.insert(0, ("the crs that was asked for", settings.crs))
-    for who, crs in named[1:]:
-        if not _same_crs(named[0], (who, crs)):
-            raise CrsError(
-                f"{named[0][0]} is {_short(named[0][1])} and {who} is {_short(crs)}: bring all "
-                "sources into one CRS first (for example with PDAL's filters.reprojection)"
-            )
-    if named:
-        _parse_crs(*named[0])
-    return settings.model_copy(update={"crs": named[0][1] if named else None})
-
-
-def _same_crs(a: tuple[str, str], b: tuple[str, str]) -> bool:
-    return a[1] == b[1] or bool(_parse_crs(*a).equals(_parse_crs(*b), ignore_axis_order=True))
-
-
-def _parse_crs(who: str, text: str) -> pyproj.CRS:
-    try:
-        return pyproj.CRS.from_user_input(text)
-    except pyproj.exceptions.CRSError as error:
-        raise CrsError(f"{who}: {_short(text)} is no CRS that pyproj reads: {error}") from None
-
-
-def _short(text: str) -> str:
-    return text if len(text) <= 80 else f"{text[:77]}…"
+    """The settings with the one CRS of the map."""
+    named = [(source.path, source.info.crs) for source in found if source.info is not None]
+    return settings.model_copy(update={"crs": one_crs(settings.crs, named)})
 
 
 def _create_or_resume(url: str, settings: IngestSettings, found: Sequence[Source]) -> TileStore:
