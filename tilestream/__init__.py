@@ -37,7 +37,6 @@ from tilestream.pipeline.jobs.along_routes import factors_along as factors_along
 from tilestream.pipeline.jobs.along_routes import observe_along as observe_along
 from tilestream.pipeline.jobs.ingest import ingest as ingest
 from tilestream.pipeline.jobs.localize import localize as localize
-from tilestream.pipeline.jobs.run_settings import RunSettings as RunSettings
 from tilestream.records import Cells as Cells
 from tilestream.records import LocalizationError as LocalizationError
 from tilestream.records import Registrations as Registrations
@@ -60,6 +59,7 @@ if TYPE_CHECKING:
     from tilestream.definitions import explain as explain
     from tilestream.pipeline.jobs.run import dataset as dataset
     from tilestream.pipeline.jobs.run import run as run
+    from tilestream.pipeline.jobs.run_settings import RunSettings as RunSettings
 
 
 def __getattr__(name: str) -> Any:
@@ -72,6 +72,8 @@ def __getattr__(name: str) -> Any:
         return import_module("tilestream.apps.view").view
     if name == "explain":
         return import_module("tilestream.definitions").explain
+    if name == "RunSettings":
+        return import_module("tilestream.pipeline.jobs.run_settings").RunSettings
     raise AttributeError(f"module 'tilestream' has no attribute {name!r}")
 
 
