@@ -53,7 +53,6 @@ from street_tiles import TILE, Floats, long_street
 import tilestream as ts
 from tilestream.factors.ghosts import ghosts_among
 from tilestream.factors.observability import (
-    box_around,
     hessian_factors,
     in_view,
     observability,
@@ -65,7 +64,7 @@ from tilestream.factors.virtual_scan import Beams, Scene, virtual_scan
 from tilestream.formats.logs import open_log
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.formats.routes import route_of
-from tilestream.grid import MM_PER_M
+from tilestream.grid import MM_PER_M, Box
 from tilestream.kernels.virtual_scan import cast
 from tilestream.pipeline.jobs.along_routes import observe_along
 from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
@@ -120,8 +119,8 @@ def cost(folder: Path, spacing: float) -> pd.DataFrame:
     place_mm, heading, seeing = whole_places(places[12]), 0.1, VirtualSettings()
     key, edge_mm = store.grid.key_at(*places[12, :2]), surfel_mm(store)
     beams = Beams.of(ts.VLP16, seeing)
-    surfels = surfels_in(store, box_around(places, 101.0))
-    cells = store.cells_in(box_around(places, 110.0), 2.0)
+    surfels = surfels_in(store, Box.around(places, 101.0))
+    cells = store.cells_in(Box.around(places, 110.0), 2.0)
 
     def scene() -> Scene:
         near = in_view(surfels, places, ts.VLP16.fov_deg, 100.0)
@@ -240,7 +239,7 @@ def themselves(
     rows = []
     for scan in open_log(str(log)).scans_at(labels["scan"].tolist()):
         assert scan.T_map_lidar is not None
-        box = box_around(scan.T_map_lidar[None, :3, 3], settings.looking_sensor.range_max + 10.0)
+        box = Box.around(scan.T_map_lidar[None, :3, 3], settings.looking_sensor.range_max + 10.0)
         cells = store.cells_in(box, settings.cell_size)
         how = (settings.label.registration, starts)
         rows.append(virtual_drive(cells, scan.points, scan.T_map_lidar, *how))
@@ -261,7 +260,7 @@ def compared(
         assert scan.T_map_lidar is not None
         place = scan.T_map_lidar[:3, 3]
         at, near = whole_places(place), seeing.range_min * MM_PER_M
-        surfels = surfels_in(store, box_around(place[None], reach + 4.0))
+        surfels = surfels_in(store, Box.around(place[None], reach + 4.0))
         if seeing.without_ghosts:
             surfels = surfels.where(~ghosts_among(surfels, edge_mm))
         scene = Scene.of(surfels, at[None], edge_mm)

@@ -1,12 +1,14 @@
 """The benchmarks: each tells its options, runs at its smallest, and no document shows another."""
 
 import argparse
+import ast
 import os
 import re
 import runpy
 import shlex
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -52,6 +54,17 @@ def started(folder: Path, script: str, *arguments: str, site: str = "") -> str:
     told = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
     assert told.returncode == 0, told.stderr
     return told.stdout
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_what_it_imports_is_there(script: str) -> None:
+    """Of the package: `--help` imports nothing, and a benchmark is run by hand only."""
+    for node in ast.walk(ast.parse((FOLDER / script).read_text())):
+        if isinstance(node, ast.ImportFrom) and str(node.module).startswith("tilestream"):
+            module = import_module(str(node.module))
+            for alias in node.names:
+                if not hasattr(module, alias.name):
+                    import_module(f"{node.module}.{alias.name}")
 
 
 @pytest.mark.parametrize("script", SCRIPTS)

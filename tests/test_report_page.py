@@ -290,7 +290,7 @@ def test_without_training_no_place_is_called_like_or_unlike(
 def test_importances_name_their_forest(page: Path) -> None:
     text = text_of(page, "importances")
     used, papers = text.split("The paper's forest on 2 factors, by factor")
-    assert "The forest in use on 2 factors, by factor" in used
+    assert "The model in use on 2 factors, by factor" in used
     assert "vd_mean OB observability 0.750 ob_info_up" in used
     assert "OB observability 2 2.00 cm ± 0.30 cm" in used
     assert "bhatt_sim LS local similarity 0.600 0.23" in papers

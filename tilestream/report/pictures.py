@@ -162,7 +162,7 @@ def paths_figure(found: Findings) -> Figure:
 
 
 def importances_figure(importances: pd.DataFrame) -> Figure:
-    """The importance of each factor to the forest in use and to the paper's (its Fig. 14), coloured
+    """The importance of each factor to the model in use and to the paper's (its Fig. 14), coloured
     by criterion.
     """
     kinds = [(name, importances[importances["model"] == name]) for name in ("used", "paper")]
@@ -176,7 +176,7 @@ def importances_figure(importances: pd.DataFrame) -> Figure:
         rows = np.arange(len(ranked))
         axes.barh(rows, ranked["importance"].to_numpy(np.float64), color=colours)
         axes.set_yticks(rows, ranked["factor"].astype(str), fontsize=8, parse_math=False)
-        whose = "the forest in use" if name == "used" else "the paper's forest on its factors"
+        whose = "the model in use" if name == "used" else "the paper's forest on its factors"
         axes.set(xlabel=f"importance to {whose}", ylim=(-0.6, len(ranked) - 0.4))
         axes.grid(axis="x", alpha=0.25)
         known = [c for c in CRITERION if c in set(ranked["criterion"].astype(str))]
