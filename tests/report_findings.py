@@ -160,7 +160,7 @@ def whole(seed: int = 0) -> Findings:
             {
                 "model": ["used", "paper", "paper"],
                 "criterion": ["OB", "FS", "LS"],
-                "factors": [2, 8, 4],
+                "factors": [2.0, 8.0, 4.0],
                 "increase": [0.02, 0.004, 0.012],
                 "spread": [0.003, 0.001, 0.002],
             }
