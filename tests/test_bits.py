@@ -231,6 +231,7 @@ MAY = {
     "factors/virtual_drive.py": "over the starts of one place",
     "formats/logs/ros2_poses.py": "4 x 4 of one pose",
     "formats/logs/poses.py": "4 x 4 of one pose",
+    "formats/logs/together.py": "4 x 4 of one pose",
     "kernels/neighbours.py": "whole numbers",
     "label.py": "3 x 3 of one pose",
     "model/domain.py": "over all training places, in one thread",

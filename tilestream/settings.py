@@ -62,7 +62,8 @@ class LogSettings(Settings):
     until_s: Positive | None = None
     """Use the scans of a log before this time [s after its first]; not given: to the end."""
     points_topic: str | None = None
-    """Topic of the scans in a log; not given: found by type."""
+    """Topic of the scans in a log, or those of all lidars of the vehicle, with commas between them:
+    their scans make one each, in the frame of the first; not given: found by type."""
     pose_topic: str | None = None
     """Topic of the poses in a log; not given: found by type."""
 

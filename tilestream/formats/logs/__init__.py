@@ -8,6 +8,7 @@ from tilestream.formats.logs.base import MAX_GAP_S, LogOptions, Recording
 from tilestream.formats.logs.mcap_write import write_log
 from tilestream.formats.logs.scan_log import ScanLog, with_poses
 from tilestream.formats.logs.selection import ScanSelection
+from tilestream.formats.logs.together import together
 from tilestream.formats.registry import (
     Format,
     format_of,
@@ -45,7 +46,9 @@ def open_log(
 
     Args:
         path: a file or directory of one of `LOG_FORMATS`.
-        points_topic: topic of the scans; default: the one with the most messages.
+        points_topic: topic of the scans; default: the one with the most messages. Several, with
+            commas between them, are the lidars of one vehicle, and their scans make one each
+            (`together`).
         pose_topic: topic of the poses; default: see the format, e.g. `mcap.open_mcap`.
         map_frame: frame that counts as the map; default `map`; with tf, where there is no such
             frame, the root of the tree above the lidar.
@@ -60,8 +63,13 @@ def open_log(
         PoseError: no poses, none at the time of any scan, or several topics that are equally good.
     """
     name = str(path)
-    options = LogOptions(points_topic, pose_topic, map_frame, pose_frame, max_gap_s)
-    return _opened(name, format_of(name, LOG_FORMATS), state_of(name), options)
+    topics = [None] if points_topic is None else [part.strip() for part in points_topic.split(",")]
+    found, state = format_of(name, LOG_FORMATS), state_of(name)
+    logs = [
+        _opened(name, found, state, LogOptions(t, pose_topic, map_frame, pose_frame, max_gap_s))
+        for t in topics
+    ]
+    return logs[0] if len(logs) == 1 else together(logs)
 
 
 @lru_cache(maxsize=8)

@@ -253,5 +253,6 @@ def slice_tasks(
         takes={"samples": scans.samples},
         reads={"starts": tuple(task.product for task in registers)},
         work=work,
+        counts={"rows": starts * len(scans.samples)},
     )
     return [*registers, summed]

@@ -54,7 +54,19 @@ ERROR_COLUMNS = (
 )
 
 
-@stage("label", version=2, memory=lambda _: 100_000_000, seconds=0.006, columns=ERROR_COLUMNS)
+FIXED_BYTES = 100_000_000
+"""Memory of the task besides what it reads: pandas and its tables."""
+BYTES_PER_ROW = 600
+"""Memory per start: its row, in parts, together and sorted."""
+
+
+@stage(
+    "label",
+    version=2,
+    memory=lambda counts: FIXED_BYTES + BYTES_PER_ROW * counts["rows"],
+    seconds=0.006,
+    columns=ERROR_COLUMNS,
+)
 def label(starts: Sequence[Stored], samples: Sequence[Sample]) -> Made:
     """A row per sample point, in their order.
 
