@@ -102,4 +102,5 @@ def _nearest(stamps_ns: Int64, log: ScanLog) -> tuple[Int64, NDArray[np.bool_]]:
 
 def _sums(logs: Sequence[ScanLog], rows: Int64, name: str) -> Int64:
     """(k,) a number of each scan over all lidars."""
-    return np.sum([getattr(log, name)[rows[:, n]] for n, log in enumerate(logs)], axis=0)
+    total: Int64 = np.sum([getattr(log, name)[rows[:, n]] for n, log in enumerate(logs)], axis=0)
+    return total
