@@ -25,7 +25,7 @@ from streets import SCANS, STREETS, job
 
 import tilestream as ts
 from tilestream.cli import run as command
-from tilestream.cli.jobs import judge_over, lost_labels
+from tilestream.cli.jobs import lost_labels, require_within
 from tilestream.cli.tables import forecast_rows
 from tilestream.errors import (
     LimitError,
@@ -840,9 +840,9 @@ def test_a_gate_does_not_open_on_places_that_nobody_estimated(
     places = pd.DataFrame({"route_id": "a", "arc_length": range(100), "estimate": estimate})
     places.to_parquet(tmp_path / "report" / "places.parquet")
     with pytest.raises(LimitError, match="10 of 100 sample points have no estimate"):
-        judge_over(tmp_path, 0.25)
+        require_within(tmp_path, 0.25)
     places.iloc[:92].to_parquet(tmp_path / "report" / "places.parquet")
-    judge_over(tmp_path, 0.25)
+    require_within(tmp_path, 0.25)
     assert "2 of 92 sample points have no estimate" in capsys.readouterr().err
 
 

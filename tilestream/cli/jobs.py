@@ -61,7 +61,7 @@ def run(
     else:
         show_report(folder)
     if fail_over is not None:
-        judge_over(folder, fail_over)
+        require_within(folder, fail_over)
 
 
 def do_job(settings: RunSettings, cluster: Cluster) -> Path:
@@ -98,8 +98,8 @@ def lost_labels(folder: Path) -> list[str]:
     return [f"{total:,} of {total + run['labelled']:,} measured places are not used: {reasons}"]
 
 
-def judge_over(folder: Path, limit: float) -> None:
-    """Fail where the estimated error is too large, or not known: a gate for a map release.
+def require_within(folder: Path, limit: float) -> None:
+    """Fail where the estimated error exceeds a limit, or is not known: a gate for a map release.
 
     Raises:
         LimitError: the gate is closed; says why (`gate`).

@@ -1,4 +1,4 @@
-"""What a report is made of: the tables that the other rooms return, checked once."""
+"""What a report is made of: the tables that a run has made, checked once."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""Drives along a street: when the vehicle is where, what moves around it, and what it scans."""
+"""Drives along a street: where the vehicle is at a time, what moves around it, what it scans."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -84,7 +84,7 @@ def _read_counts(task: Task) -> Mapping[str, int]:
 def attempt(task: Task, memory: int | None = None) -> Outcome:
     """Do the work of a task and say what became of it; never raises.
 
-    A verdict of our own on the data (`TilestreamError`), a path that cannot be used and a bug
+    What we refuse ourselves (`TilestreamError`), a path that cannot be used and a bug
     stand; where the disk, the network or the memory failed, another try may succeed.
 
     Args:

@@ -69,7 +69,7 @@ class ProgressPlugin(SchedulerPlugin):
         self._look.stop()
 
     def log_event(self, topic: str, msg: Any) -> None:
-        """What a client tells."""
+        """Called for each message of a client."""
         if topic != NAME:
             return
         if msg["op"] == "plan":
@@ -151,7 +151,7 @@ class JsonHandler(RequestHandler):
         self.plugin = plugin
 
     def get(self) -> None:
-        """Answer."""
+        """Send the state of the run as JSON."""
         facts = self.plugin.facts()
         if self.get_query_argument("tiles", ""):
             facts["tiles"] = self.plugin.progress.tile_facts()

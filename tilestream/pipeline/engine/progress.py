@@ -1,4 +1,4 @@
-"""How far a run is: what its client tells, what the scheduler sees, and the figures of both.
+"""How far a run is: what its client sends, what the scheduler sees, and the figures of both.
 
 Plain state without Dask: the page on the dashboard shows it, the JSON route prints it.
 """

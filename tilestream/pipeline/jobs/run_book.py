@@ -1,4 +1,4 @@
-"""The book of a run: what it did so far, kept in `run.json`."""
+"""The record of a run: what it did so far, kept in `run.json`."""
 
 import json
 import os
@@ -115,7 +115,7 @@ class Book:
 
 
 def told_before(path: Path) -> dict[str, Any]:
-    """The book of earlier calls; empty where there is none, or none of this kind."""
+    """The record of earlier calls; empty where there is none, or none of this kind."""
     try:
         told = json.loads(path.read_text())
     except (OSError, ValueError):

@@ -212,7 +212,7 @@ def observing_of(settings: RunSettings, seeing: VirtualSettings) -> Observing:
 def observing_drive(
     settings: RunSettings, seeing: VirtualSettings, drive: DriveSettings
 ) -> Observing:
-    """What a drive is observed with: the vehicle's lidar, as far as the drive is read as a lesser
+    """What a drive is observed with: the vehicle's lidar, as far as the drive is read as a simpler
     one; that of the vehicle itself where it is not.
 
     Raises:
