@@ -1,6 +1,7 @@
 """A vehicle of several lidars in a log: their scans make one each, wherever they are mounted."""
 
 from pathlib import Path
+from typing import Any
 
 import logs
 import numpy as np
@@ -9,7 +10,7 @@ from logs import SECOND, START, cloud_at, odometry_at, pose, static_tf
 from scenes import PLACES, in_map
 
 import tilestream as ts
-from tilestream.errors import SourceError
+from tilestream.errors import SourceError, UsageError
 from tilestream.formats.logs import open_log
 from tilestream.formats.logs.together import APART_NS
 from tilestream.formats.points.pcd import write_pcd
@@ -95,6 +96,12 @@ def test_lidars_that_never_scan_together_are_refused(tmp_path: Path) -> None:
     path = two_lidars(tmp_path / "two.mcap", later=APART_NS + SECOND // 50)
     with pytest.raises(SourceError, match="/front, /rear"):
         open_log(path, points_topic="/front,/rear")
+
+
+@pytest.mark.parametrize("how", [{"beams": 8}, {"deskew": True, "sweep_s": 0.1}])
+def test_what_only_one_lidar_knows_is_refused(how: dict[str, Any]) -> None:
+    with pytest.raises(UsageError, match="name one topic"):
+        Reading("two.mcap", "/front,/rear", **how)
 
 
 def test_a_vehicle_is_labelled_by_the_cloud_of_its_lidars(tmp_path: Path) -> None:

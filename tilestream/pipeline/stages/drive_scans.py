@@ -53,11 +53,16 @@ class Reading:
         """Refuse what no scan could be read as, before any task runs.
 
         Raises:
-            UsageError: a number outside of its range.
+            UsageError: a number outside of its range; what is known of one lidar, asked of several.
         """
         self._degraded(Scan(0, np.zeros((0, 3))))
         if self.sweep_s is not None and not 0.0 < self.sweep_s < math.inf:
             raise UsageError(f"sweep is {self.sweep_s!r}: give a positive time in seconds")
+        if "," in (self.points_topic or "") and (self.beams or self.deskew):
+            raise UsageError(
+                f"{self.points_topic}: beams and times of points are those of one lidar, and not "
+                "known of several together: leave beams and deskew out, or name one topic"
+            )
 
     @property
     def state(self) -> str:
