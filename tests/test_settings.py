@@ -41,7 +41,7 @@ OWN = {
     ("simulate", "paths"): "with commas between them",
 }
 """Options that share a setting's name and have a default of their own."""
-FILES = {"store", "folder", "name", "sources", "city"}
+FILES = {"store", "folder", "name", "sources", "city", "log"}
 """What a command works on: no settings of it, whatever a job's file calls so."""
 JOBS = (ts.ingest, ts.localize, ts.factors_along, ts.observe_along, compare)
 
