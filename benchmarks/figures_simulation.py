@@ -90,6 +90,7 @@ def district(city: City, path: Path) -> None:
     ax.set_title("Simulated Shinjuku on real footprints (Project PLATEAU, CC BY 4.0)")
     fig.tight_layout()
     fig.savefig(path, dpi=70)
+    print(f"{path}: {path.stat().st_size / 1024:.0f} kB")
     plt.close(fig)
 
 
@@ -122,6 +123,7 @@ def spots(city: City, path: Path) -> None:
         mapped.set(xlim=(-60, 60), ylim=(-60, 60), aspect="equal", title="map of 24 m, one pass")
     fig.tight_layout()
     fig.savefig(path, dpi=55)
+    print(f"{path}: {path.stat().st_size / 1024:.0f} kB")
     plt.close(fig)
 
 
@@ -160,6 +162,7 @@ def errors(city: City, folder: Path, preset: str, path: Path) -> None:
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     ax.set_title(f"Measured localization error, preset {preset} (buildings: PLATEAU, CC BY 4.0)")
     fig.savefig(path, dpi=60, bbox_inches="tight")
+    print(f"{path}: {path.stat().st_size / 1024:.0f} kB")
     plt.close(fig)
 
 
