@@ -14,6 +14,7 @@ from tilestream.errors import SourceError, UsageError
 from tilestream.formats.logs import open_log
 from tilestream.formats.logs.together import APART_NS
 from tilestream.formats.points.pcd import write_pcd
+from tilestream.pipeline.jobs.run_inputs import inputs_of
 from tilestream.pipeline.stages.drive_scans import Reading
 
 FRONT, REAR = pose(x=1.2, z=0.3), pose(x=-0.8, y=0.1, yaw=np.pi)
@@ -117,3 +118,13 @@ def test_a_vehicle_is_labelled_by_the_cloud_of_its_lidars(tmp_path: Path) -> Non
         assert labels["error_mean"].max() < 0.2
         points[topic] = labels["points"].mean()
     assert points["/front,/rear"] > 1.5 * points["/front"]
+
+
+def test_a_drive_of_fewer_lidars_than_the_vehicle_is_said_to_be(tmp_path: Path) -> None:
+    drive = str(two_lidars(tmp_path / "two.mcap"))
+    values: dict[str, Any] = {"out": str(tmp_path), "map": {"store": "map.zarr"}}
+    for topic, sensors, notes in (("/front", 2, 1), ("/front,/rear", 2, 0), ("/front", 1, 0)):
+        drives = [{"log": drive, "points_topic": topic}]
+        lidars = [{"name": "VLP16", "mount": {"x": float(i)}} for i in range(sensors)]
+        job = ts.RunSettings(**values, drives=drives, sensor=lidars)
+        assert len(inputs_of(job, None, None).notes) == notes

@@ -48,6 +48,7 @@ def read_routes(
     max_jump: float = 1000.0,
     z_offset: float | None = None,
     pose_topic: str | None = None,
+    points_topic: str | None = None,
 ) -> list[Route]:
     """The routes in a file, known by its ending:
 
@@ -74,6 +75,7 @@ def read_routes(
         z_offset: added to z, so that the route lies on the road: minus the height of the recorded
             frame. None: z as it is in the file; no z for a log, whose poses are the lidar's.
         pose_topic: topic of the poses of a log.
+        points_topic: topic of the scans of a log, of whose lidar its poses are.
 
     Raises:
         SourceNotFoundError: no such file.
@@ -84,7 +86,7 @@ def read_routes(
         CrsError: degrees without `project_to`, or a CRS that cannot be used.
     """
     name = str(path)
-    paths = _paths(name, pose_topic)
+    paths = _paths(name, pose_topic, points_topic)
     if not paths:
         raise CorruptSourceError(f"{name}: holds no route")
     crs = crs or paths[0].crs
@@ -134,11 +136,11 @@ def read_route(
     return chosen[0]
 
 
-def _paths(path: str, pose_topic: str | None) -> list[Path3]:
+def _paths(path: str, pose_topic: str | None, points_topic: str | None) -> list[Path3]:
     """The paths that a file draws, in its own coordinates."""
     ending = Path(path).suffix.lower()
     if is_log(path):
-        poses = open_log(path, pose_topic=pose_topic).trajectory
+        poses = open_log(path, points_topic=points_topic, pose_topic=pose_topic).trajectory
         return [Path3(Path(path).stem, poses.T_map_lidar[:, :3, 3].copy())]
     if not Path(path).is_file():
         raise SourceNotFoundError(f"{path}: no such file; check the path")

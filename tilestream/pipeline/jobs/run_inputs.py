@@ -1,6 +1,6 @@
 """What the main job works on: its settings and files."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from glob import glob
 from pathlib import Path
@@ -61,7 +61,8 @@ def inputs_of(settings: RunSettings, client: Any | None, watch: Watch | None) ->
         files = settings.routes or tuple(dict.fromkeys(drive.log for drive in drives))
         if not files:
             return Inputs(settings.map.sources, drives, *_all_streets(settings))
-        return Inputs(settings.map.sources, drives, _routes(files, settings))
+        routes, notes = _routes(files, settings), tuple(_other_lidars(settings))
+        return Inputs(settings.map.sources, drives, routes, notes=notes)
     folder = simulated_folder(settings)
     wanted = settings.simulate
     for drive in simulations(wanted):
@@ -83,6 +84,18 @@ def inputs_of(settings: RunSettings, client: Any | None, watch: Watch | None) ->
         notes=(f"Simulated, preset {preset.preset}: {preset.note}",),
         attributions=(ATTRIBUTION,),
     )
+
+
+def _other_lidars(settings: RunSettings) -> Iterator[str]:
+    """A note for each drive that is labelled with another number of lidars than the vehicle has."""
+    has = len(settings.vehicle.sensors)
+    for drive in settings.drives:
+        named = len((drive.points_topic or "").split(","))
+        if named != has:
+            yield (
+                f"Drive {drive.group} is labelled with the scans of {named} of its lidars, the "
+                f"vehicle is observed with {has}: name a topic for each in points_topic."
+            )
 
 
 def simulations(wanted: SimulateSettings) -> list[SimulationSettings]:
@@ -142,7 +155,12 @@ def _all_streets(settings: RunSettings) -> tuple[tuple[Route, ...], tuple[str, .
 
 
 def _routes(files: Sequence[str], settings: RunSettings) -> tuple[Route, ...]:
-    found = [r for path in files for r in read_routes(path, project_to=settings.project_to)]
+    of_log = {drive.log: drive for drive in reversed(settings.drives)}
+    found: list[Route] = []
+    for path in files:  # the way of a drive is that of its own poses
+        drive = of_log.get(path)
+        topics = {} if drive is None else drive.model_dump(include={"pose_topic", "points_topic"})
+        found += read_routes(path, project_to=settings.project_to, **topics)
     names = [route.route_id for route in found]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
