@@ -37,6 +37,7 @@ SMALLEST = (
     "shinjuku_routes.py routes.geojson",
     "simulate.py --metres 1",
     "virtual_drive.py cost --tiles 1 --spacing 0.5",
+    "walk.py",
 )
 OF_A_FINISHED_RUN = (
     "drive_estimate.py drive",
