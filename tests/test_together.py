@@ -99,6 +99,11 @@ def test_lidars_that_never_scan_together_are_refused(tmp_path: Path) -> None:
         open_log(path, points_topic="/front,/rear")
 
 
+def test_a_lidar_that_is_named_twice_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="named twice"):
+        open_log(two_lidars(tmp_path / "two.mcap"), points_topic="/front,/front")
+
+
 @pytest.mark.parametrize("how", [{"beams": 8}, {"deskew": True, "sweep_s": 0.1}])
 def test_what_only_one_lidar_knows_is_refused(how: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match="name one topic"):

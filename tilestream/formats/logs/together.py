@@ -54,15 +54,17 @@ def together(logs: Sequence[ScanLog]) -> ScanLog:
         logs: the scans of each lidar, of one recording; the first gives frame and times.
 
     Raises:
-        SourceError: no scan has partners.
+        SourceError: no scan has partners, or a topic is named twice.
     """
     first, *others = logs
+    topics = ", ".join(log.points_topic for log in logs)
+    if len({log.points_topic for log in logs}) < len(logs):
+        raise SourceError(f"{first.path}: {topics}: a lidar is named twice")
     parts, found = [np.arange(len(first))], first.posed
     for other in others:
         nearest, there = _nearest(first.stamps_ns, other)
         parts.append(nearest)
         found = found & there
-    topics = ", ".join(log.points_topic for log in logs)
     if not found.any():
         raise SourceError(
             f"{first.path}: no scans of {topics} with poses lie within {APART_NS / 1e9:g} s of "
