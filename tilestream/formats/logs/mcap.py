@@ -119,7 +119,8 @@ def _choose_clouds(file: McapFile, named: str | None, notes: list[str]) -> str:
     if len(best) > 1:
         raise SourceError(
             f"{file.path}: several topics have {most} clouds each: "
-            f"{', '.join(t.name for t in best)}; name one as points_topic"
+            f"{', '.join(t.name for t in best)}; name one as points_topic, or with commas all that "
+            "are lidars of one vehicle"
         )
     if best[0].encoding != "cdr":
         raise SourceError(
