@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import logs
@@ -121,7 +122,9 @@ def test_without_a_terminal_progress_is_a_line_now_and_then(
     monkeypatch: pytest.MonkeyPatch, capsys: Told
 ) -> None:
     clock = iter([0.0, 1.0, 31.0, 31.0, 50.0, 62.0, 62.0])
-    monkeypatch.setattr("tilestream.cli.progress.time.monotonic", lambda: next(clock))
+    # not time.monotonic itself, which Dask's event loop in another thread asks too
+    own = SimpleNamespace(monotonic=lambda: next(clock))
+    monkeypatch.setattr("tilestream.cli.progress.time", own)
     with progress() as watch:
         for stage, ended in (("merge", 1), ("cells", 1), ("cells", 2), ("cells", 3)):
             watch(Outcome(f"{stage}-{ended}", stage), ended, 3)
