@@ -12,8 +12,8 @@ import tilestream
 ROOT = Path(tilestream.__file__).parent
 FLOORS = (
     ("errors", "version"),
-    ("config", "grid", "marks"),
-    ("kernels",),
+    ("config", "files", "grid", "marks"),
+    ("kernels", "lock"),
     ("sensor",),
     ("records",),
     ("settings",),

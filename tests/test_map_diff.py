@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from hand_made import listed
 from scenes import scene
 
 import tilestream as ts
@@ -36,6 +37,7 @@ def estimated(run_dir: Path, x: list[float], estimate: list[float]) -> None:
     write_table(
         str(run_dir / "tables" / "predictions" / "0_0.parquet"), frame, columns, Mark("done")
     )
+    listed(run_dir)
 
 
 @pytest.fixture(scope="module")

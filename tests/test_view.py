@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from hand_made import listed
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -63,6 +64,7 @@ def run_dir(store: ts.TileStore, tmp_path_factory: pytest.TempPathFactory) -> Pa
     path, columns = tables / "predictions" / "0_0.parquet", (*PLACE_COLUMNS, *PREDICTION_COLUMNS)
     write_places(path, columns, [5.2, 20, 25, 30], store, estimate=ESTIMATED)
     write_places(tables / "factors" / "0_0.parquet", PLACE_COLUMNS, [20, 35], store)
+    listed(tables)
     return tables.parent
 
 
@@ -155,6 +157,7 @@ def test_the_map_of_a_run_is_found_inside_it_or_by_its_tables(
     mark = Mark("done", facts={"store": str(tmp_path / "gone.zarr")})
     frame = pd.DataFrame({"x": [0.0], "y": [0.0], "z": [0.0]})
     write_table(str(moved / "tables" / "factors" / "0.parquet"), frame, PLACE_COLUMNS, mark)
+    listed(moved)
     with pytest.raises(StoreNotFoundError, match=r"gone\.zarr.*link"):
         map_of(moved)
     (moved / "map.zarr").symlink_to(store.address)

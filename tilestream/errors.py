@@ -53,6 +53,18 @@ class TileNotReadyError(StoreError, LookupError):
     """A tile (or one of its tables) that is missing, failed or skipped; the message says why."""
 
 
+class DamagedError(StoreError, ValueError):
+    """A stored file that is not what was written; the message names it."""
+
+
+class IncompleteError(StoreError, LookupError):
+    """A map or run that is half-made, or has lost something that must exist."""
+
+
+class LockedError(StoreError):
+    """A folder or store that another process writes to."""
+
+
 class RegistrationError(TilestreamError, ValueError):
     """A scan that cannot be registered: nothing near it, too few points, start poses not rigid."""
 

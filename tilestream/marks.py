@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 import json
 import os
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -13,7 +14,7 @@ from pydantic import BaseModel
 
 from tilestream.version import VERSION
 
-Status = Literal["missing", "done", "failed", "skipped"]
+Status = Literal["missing", "damaged", "done", "failed", "skipped"]
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,7 @@ class Mark:
     """What became of a table; written last, checked by every reader."""
 
     status: Status
-    """`done`: whole. `failed` or `skipped`: not there, and `reason` says why."""
+    """`done`: whole. All others: not there, and `reason` says why."""
     reason: str = ""
     """Why it failed or was skipped."""
     identity: str = ""
@@ -36,7 +37,33 @@ class Mark:
         return self.status == "done" and self.identity == identity
 
 
+SEAL = "checksum"
+"""The field of a JSON object that holds the checksum of the others."""
+AGAIN = "remove it (`tilestream verify --repair` does) and run the same command again"
+"""What to do about a damaged file."""
 MISSING = Mark(status="missing", reason="not written yet", code="")
+
+
+def sealed(content: Mapping[str, Any]) -> dict[str, Any]:
+    """A JSON object with the checksum of all else in it."""
+    return {**content, SEAL: _seal_of(content)}
+
+
+def unsealed(content: Mapping[str, Any]) -> dict[str, Any]:
+    """What was sealed.
+
+    Raises:
+        ValueError: it is not what it was then.
+    """
+    inside = {name: value for name, value in content.items() if name != SEAL}
+    if content.get(SEAL) != _seal_of(inside):
+        raise ValueError("its checksum does not fit")
+    return inside
+
+
+def _seal_of(content: Mapping[str, Any]) -> str:
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    return f"{zlib.crc32(text.encode()):08x}"
 
 
 def hash_of(*values: Any) -> str:

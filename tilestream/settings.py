@@ -88,6 +88,8 @@ class MapSettings(IngestSettings, LogSettings):
     """Files, globs and map directories; empty with `simulate`: its survey."""
     store: str | None = None
     """Path or URL of the tile store; not given: `map.zarr` in the run directory."""
+    partial: bool = False
+    """Go on with a map that is half-made or has lost tiles; places that could see a gap say so."""
 
 
 class DriveSettings(LogSettings):

@@ -1,21 +1,28 @@
-"""Tables as Parquet files: every column documented inside, whole or not there, marked as done."""
+"""Tables as Parquet files: every column documented inside, whole or not there, marked as done.
+
+Each page has its checksum, and the whole file one: what is read is what was written.
+"""
 
 import io
 import json
-import uuid
+import zlib
 from collections.abc import Sequence
 from dataclasses import asdict
 
-import fsspec
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from tilestream.errors import CorruptSourceError, SourceNotFoundError, UsageError
-from tilestream.marks import MISSING, Mark
+from tilestream.errors import DamagedError, SourceNotFoundError
+from tilestream.files import Files
+from tilestream.marks import AGAIN, MISSING, Mark, sealed, unsealed
 from tilestream.records import Column
 
 _MARK = b"tilestream"
+_CHECKSUM = b"tilestream.checksum"
+"""The entry of a file's footer that holds the checksum of all other bytes."""
+_UNKNOWN = b"00000000"
+"""That checksum while it is not known yet."""
 
 
 def write_table(path: str, frame: pd.DataFrame, columns: Sequence[Column], mark: Mark) -> None:
@@ -39,51 +46,45 @@ def write_table(path: str, frame: pd.DataFrame, columns: Sequence[Column], mark:
         )
         for field in table.schema
     ]
-    table = table.cast(pa.schema(fields, {_MARK: json.dumps(asdict(mark), sort_keys=True)}))
+    text = json.dumps(sealed(asdict(mark)), sort_keys=True)
+    table = table.cast(pa.schema(fields, {_MARK: text}))
     buffer = io.BytesIO()
-    pq.write_table(table, buffer, compression="zstd")
-    fs, place = fsspec.core.url_to_fs(path)
-    fs.makedirs(place.rsplit("/", 1)[0], exist_ok=True)
-    part = f"{place}.{uuid.uuid4().hex}.part"
-    try:
-        fs.pipe_file(part, buffer.getvalue())
-        fs.mv(part, place)
-    except OSError:
-        if fs.exists(part):
-            fs.rm(part)
-        raise
+    with pq.ParquetWriter(
+        buffer, table.schema, compression="zstd", write_page_checksum=True
+    ) as writer:
+        writer.write_table(table)
+        writer.add_key_value_metadata({_CHECKSUM: _UNKNOWN})
+    content = buffer.getvalue()
+    at = _checksum_at(content)
+    Files.at(path).write(b"%s%08x%s" % (content[:at], zlib.crc32(content), content[at + 8 :]))
+
+
+def _checksum_at(content: bytes) -> int:
+    """Where the eight hex digits of a file's checksum are; -1: nowhere."""
+    name = content.rfind(_CHECKSUM)
+    # Thrift writes the value behind the name: a byte for the field, one for its length.
+    return name + len(_CHECKSUM) + 2 if name >= 0 else -1
 
 
 def read_mark(path: str) -> Mark:
-    """The mark of a table; `missing` where no whole table is at `path`, or one of version 0.1."""
-    fs, place = fsspec.core.url_to_fs(path)
-    try:
-        with fs.open(place, "rb") as file:
-            metadata = pq.read_schema(file).metadata or {}
-    except (FileNotFoundError, pa.ArrowInvalid):
-        return MISSING
-    known = json.loads(metadata.get(_MARK, b"{}"))
-    return Mark(**known) if "status" in known else MISSING
-
-
-def remove_others(keep: Sequence[str]) -> None:
-    """Make the folder of these tables hold no others: of other settings, or half-written.
-
-    It is made where it is missing, so that one that cannot be is told before any work.
+    """The mark of a table; `missing` where no table is at `path`, or one of version 0.1, and
+    `damaged` where it is not what was written.
 
     Raises:
-        UsageError: the folder is a file, or below one.
+        OSError: it cannot be read.
     """
-    fs, place = fsspec.core.url_to_fs(keep[0])
-    folder = place.rsplit("/", 1)[0]
+    place = Files.at(path)
     try:
-        fs.makedirs(folder, exist_ok=True)
-    except (FileExistsError, NotADirectoryError):
-        raise UsageError(f"{folder} is a file, or below one: name another folder") from None
-    names = {path.rsplit("/", 1)[-1] for path in keep}
-    for path in [*fs.glob(f"{folder}/*.parquet"), *fs.glob(f"{folder}/*.part")]:
-        if str(path).rsplit("/", 1)[-1] not in names:
-            fs.rm_file(path)
+        with place.fs.open(place.root, "rb") as file:
+            metadata = pq.read_schema(file).metadata or {}
+        known = json.loads(metadata.get(_MARK, b"{}"))
+        return Mark(**unsealed(known)) if "status" in known else MISSING
+    except FileNotFoundError:
+        return MISSING
+    except (pa.ArrowException, ValueError, TypeError, OSError) as error:
+        if isinstance(error, OSError) and error.errno is not None:  # Arrow's own has none
+            raise
+        return Mark("damaged", f"{path} is damaged ({error}): {AGAIN}")
 
 
 def read_tables(paths: Sequence[str]) -> pd.DataFrame:
@@ -91,19 +92,24 @@ def read_tables(paths: Sequence[str]) -> pd.DataFrame:
 
     Raises:
         SourceNotFoundError: a file is not there, or `paths` is empty.
-        CorruptSourceError: a file is no Parquet table.
+        DamagedError: a file is not what was written.
+        OSError: a file cannot be read.
     """
     if not paths:
         raise SourceNotFoundError("no tables: the job that writes them has not run here")
-    frames = []
-    for path in paths:
-        fs, place = fsspec.core.url_to_fs(path)
-        try:
-            with fs.open(place, "rb") as file:
-                frames.append(pq.read_table(file).to_pandas())
-        except FileNotFoundError:
-            raise SourceNotFoundError(f"{path}: no such table") from None
-        except pa.ArrowInvalid as error:
-            raise CorruptSourceError(f"{path}: no Parquet table: {error}") from error
-    rows: pd.DataFrame = pd.concat(frames, ignore_index=True)
+    rows: pd.DataFrame = pd.concat([_read(path) for path in paths], ignore_index=True)
     return rows
+
+
+def _read(path: str) -> pd.DataFrame:
+    try:
+        content = Files.at(path).read()
+    except FileNotFoundError:
+        raise SourceNotFoundError(f"{path}: no such table") from None
+    at = _checksum_at(content)
+    bare = content[:at] + _UNKNOWN + content[at + 8 :]
+    if at < 0 or content[at : at + 8] != b"%08x" % zlib.crc32(bare):
+        raise DamagedError(f"{path} is damaged, its checksum does not fit: {AGAIN}")
+    read = pq.read_table(io.BytesIO(content), page_checksum_verification=True)
+    frame: pd.DataFrame = read.to_pandas()
+    return frame

@@ -16,10 +16,11 @@ import pandas as pd
 from tilestream.errors import PartialError, UsageError
 from tilestream.factors.rows import in_route_order, samples_by_tile
 from tilestream.grid import MM_PER_M, whole_mm
-from tilestream.pipeline.engine.executor import Watch, execute
+from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, paths_of
 from tilestream.pipeline.engine.stage import Task
 from tilestream.pipeline.jobs.along_routes import SENSOR_HEIGHT, plan_observe
+from tilestream.pipeline.jobs.inventory import make_tables
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.observe import Observing, observe
 from tilestream.records import Route
@@ -27,7 +28,7 @@ from tilestream.report.comparison import CELL_COLUMNS, ROW_COLUMNS, USUAL, Compa
 from tilestream.sensor import Carrier
 from tilestream.settings import LabelSettings, RegistrationSettings, VirtualSettings
 from tilestream.store import TileStore, cells_table
-from tilestream.tables import read_tables, remove_others
+from tilestream.tables import read_tables
 
 SPACING = 5.0
 """Distance between sample points [m]: a comparison needs fewer than an estimate."""
@@ -114,6 +115,7 @@ def compare(
     client: Any | None = None,
     memory: int = DEFAULT_MEMORY,
     watch: Watch | None = None,
+    partial: bool = False,
 ) -> Comparison:
     """The virtual drive along routes as each of several choices, resumable, in parallel.
 
@@ -130,6 +132,7 @@ def compare(
         client: a Dask client to run on; None: this process.
         memory: what a task may use [bytes].
         watch: is told of each task that ended.
+        partial: go on with a map that is not whole; rows that could see what is missing say so.
 
     Returns:
         The rows of all choices and the cells of the map, the same to the bit on any number of
@@ -138,21 +141,20 @@ def compare(
     Raises:
         UsageError: no choices or two of one name, a cell size that the tiles are no multiple of,
             no routes, two of one name, settings that cannot be.
+        IncompleteError: the map is not whole, and not `partial`.
+        LockedError: another process writes to the folder.
         PlanError: a task does not fit `memory`.
         PartialError: some tasks failed; the message lists them, the rest is done.
     """
     routes, registration = list(routes), registration or LabelSettings().registration
     seeing = seeing or VirtualSettings()
     plan = plan_compare(
-        store, routes, out, choices, spacing, registration, sensor_height, seeing, memory
+        store, routes, out, choices, spacing, registration, sensor_height, seeing, memory, partial
     )
     tables: dict[str, list[str]] = {choice.name: [] for choice in choices}
     for path in paths_of(plan.outputs(observe.name)):
         tables[path.rsplit("/", 3)[1]].append(path)
-    for kept in tables.values():
-        remove_others(kept)
-    outcomes = execute(plan, client, watch)
-    failures = {outcome.key: outcome.reason for outcome in outcomes if not outcome.ok}
+    failures = make_tables(plan, out, client, watch)
     if failures:
         raise PartialError(f"{out}: {len(failures)} tasks failed, the rest is done:", failures)
     order = [route.route_id for route in routes]
@@ -183,12 +185,13 @@ def plan_compare(
     sensor_height: float,
     seeing: VirtualSettings,
     memory: int,
+    partial: bool = False,
 ) -> Plan:
     """What `compare` will run; arguments and errors as there."""
     require_names(choices)
     sizes_mm = sorted({whole_mm(choice.cell_size, "cell_size") for choice in choices})
     require_sizes(store, sizes_mm)
-    map_plan = MapPlan.of_store(store)
+    map_plan = MapPlan.of_store(store, partial=partial)
     tasks: list[Task] = []
     samples = samples_by_tile(store.grid, routes, spacing)
     for choice in choices:

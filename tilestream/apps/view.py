@@ -18,7 +18,7 @@ from matplotlib.image import imsave
 from tilestream.apps.camera import oblique
 from tilestream.apps.scene import MOST_POINTS, Scene, scene_of
 from tilestream.errors import DisplayError, UsageError
-from tilestream.formats.points.rows import writing_whole
+from tilestream.files import Files
 from tilestream.kernels import cells as _numba_first  # noqa: F401  Open3D brings an older libtbb
 from tilestream.report.pictures import NOTHING
 
@@ -95,7 +95,7 @@ def show(scene: Scene, screenshot: str | os.PathLike[str] | None = None) -> None
         if screenshot is None:
             return
         picture = np.asarray(window.capture_screen_float_buffer(do_render=True))
-    with writing_whole(Path(screenshot)) as file:
+    with Files.at(screenshot).writing() as file:
         imsave(file, np.clip(picture, 0.0, 1.0), format="png")
 
 

@@ -31,6 +31,10 @@ MARKUP: Any = "markdown"  # the other mode takes [m] for a style
 COMMANDS = {
     "ingest": ("maps", "Make a tile store from point clouds, map directories and logs of drives."),
     "status": ("maps", "Show the tiles of a store: counts, extents, status and reasons."),
+    "verify": (
+        "maps",
+        "Read everything that is stored there; list what is damaged, half-made or lost.",
+    ),
     "info": ("maps", "Show what is in a file or log: points, bounds, fields, topics, CRS."),
     "localize": (
         "routes",

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from tilestream.apps import diff as map_diff
+from tilestream.apps import verify as verifying
 from tilestream.cli.cluster import HERE, Cluster, on_cluster
 from tilestream.cli.fields import fields, with_settings
 from tilestream.cli.options import AsJson, DryRun, StoreUrl
@@ -75,10 +76,14 @@ def status(
     marks = opened.marks(POINTS)
     failures = {f"tile {k}": m.reason for k, m in marks.items() if m.status == "failed"}
     failures |= {s["path"]: s["reason"] for s in opened.sources() if s["reason"]}
+    condition = opened.condition()
+    failures |= {} if condition.whole else {opened.url: str(condition)}
     if as_json:
         print_json(
             {
                 "url": opened.url,
+                "whole": condition.whole,
+                "condition": str(condition),
                 "settings": asdict(opened.settings),
                 "sources": opened.sources(),
                 "tiles": {str(key): asdict(mark) for key, mark in marks.items()},
@@ -86,8 +91,46 @@ def status(
         )
     else:
         out.print(tile_table(opened))
+        say(f"The map is {condition}")
     if failures:
-        raise PartialError(f"{store}: {len(failures)} sources or tiles failed:", failures)
+        raise PartialError(f"{store}: the map is not whole, or parts of it failed:", failures)
+
+
+def verify(
+    place: Annotated[str, typer.Argument(help="A tile store, a run directory, or its tables.")],
+    repair: Annotated[
+        bool,
+        typer.Option(
+            "--repair",
+            help="Remove what is damaged and can be made again, which the same command then does.",
+        ),
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Read everything that is stored there; list what is damaged, half-made or lost."""
+    read, left = verifying.verify(place)
+    removed: list[verifying.Damage] = []
+    if repair and left:
+        removed, left = verifying.repair(place)
+    if as_json:
+        told = {"removed": removed, "damaged": left}
+        lists = {name: [{"path": d.path, "reason": d.reason} for d in told[name]] for name in told}
+        print_json({"read": read, **lists})
+    else:
+        for damage in removed:
+            say(f"removed {damage.path}: {damage.reason}")
+        if removed:
+            say("Run the commands that made these again: they make them anew")
+        say(f"{read - len(removed) - len(left):,} of {read:,} are as they were written")
+    if left:
+        reasons = {d.path: d.reason + _why_left(d) for d in left}
+        raise PartialError(f"{place}: {len(left)} damaged, half-made or lost:", reasons)
+
+
+def _why_left(damage: verifying.Damage) -> str:
+    """Why something damaged cannot be removed, as far as that is not clear."""
+    missing = verifying.gone(damage)
+    return f"; made from {missing[0]}, which is gone" if missing else ""
 
 
 def info(

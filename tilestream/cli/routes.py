@@ -9,7 +9,7 @@ from tilestream.apps import compare as comparing
 from tilestream.cli.cluster import HERE, Cluster, on_cluster
 from tilestream.cli.fields import fields, with_settings
 from tilestream.cli.maps import LOG_FIELDS
-from tilestream.cli.options import AsJson, DryRun, Routes, StoreUrl, numbers, routes_of
+from tilestream.cli.options import AsJson, DryRun, Partial, Routes, StoreUrl, numbers, routes_of
 from tilestream.cli.printing import out, print_json, say
 from tilestream.cli.progress import progress
 from tilestream.cli.tables import (
@@ -69,6 +69,7 @@ def localize(
     starts_per_task: Annotated[
         int | None, typer.Option(help="Split the starts; default: no.")
     ] = None,
+    partial: Partial = False,
     dry_run: DryRun = False,
     as_json: AsJson = False,
     cluster: Cluster = HERE,
@@ -89,13 +90,22 @@ def localize(
     if dry_run:
         out.print(
             plan_table(
-                localize_drive.plan_localize(MapPlan.of_store(opened), reading, folder, **how)
+                localize_drive.plan_localize(
+                    MapPlan.of_store(opened, partial=partial), reading, folder, **how
+                )
             )
         )
         return
     with cluster.client(places.memory) as client, progress() as watch:
         found = localize_drive.localize(
-            opened, drive.log, folder, **how, reading=reading, client=client, watch=watch
+            opened,
+            drive.log,
+            folder,
+            **how,
+            reading=reading,
+            client=client,
+            watch=watch,
+            partial=partial,
         )
     if as_json:
         print_json({"matcher": registration.told, **error_facts(found)})
@@ -119,6 +129,7 @@ def factors(
         fields("spacing", "sensor", "sensor_height", "cell_size", "project_to", "memory"),
     ],
     which: Annotated[Which, typer.Option(help="The paper's 20, their robust twins.")] = "all",
+    partial: Partial = False,
     dry_run: DryRun = False,
     as_json: AsJson = False,
     cluster: Cluster = HERE,
@@ -130,7 +141,7 @@ def factors(
         looking = Looking(sensor, places.cell_size, which, height)
         samples = samples_by_tile(opened.grid, routes, places.spacing)
         plan = along_routes.plan_factors(
-            MapPlan.of_store(opened), samples, folder, looking, places.memory
+            MapPlan.of_store(opened, partial=partial), samples, folder, looking, places.memory
         )
         out.print(plan_table(plan))
         return
@@ -147,6 +158,7 @@ def factors(
             client=client,
             memory=places.memory,
             watch=watch,
+            partial=partial,
         )
     counts = rows["status"].value_counts()
     if as_json:
@@ -183,6 +195,7 @@ def compare(
     cap: Annotated[
         float, typer.Option(help="What 95 % of a tile's estimates must stay within [m].")
     ] = 0.15,
+    partial: Partial = False,
     dry_run: DryRun = False,
     as_json: AsJson = False,
     cluster: Cluster = HERE,
@@ -199,7 +212,7 @@ def compare(
     )
     registration, height = labels.registration, places.sensor_height
     if dry_run:
-        how = (places.spacing, registration, height, VirtualSettings(), places.memory)
+        how = (places.spacing, registration, height, VirtualSettings(), places.memory, partial)
         out.print(plan_table(comparing.plan_compare(opened, routes, folder, choices, *how)))
         return
     with cluster.client(places.memory) as client, progress() as watch:
@@ -214,6 +227,7 @@ def compare(
             client=client,
             memory=places.memory,
             watch=watch,
+            partial=partial,
         )
     content = write_comparison(found, folder, threshold=report.threshold, cap=cap)
     _show_comparison(content, store, folder, as_json)

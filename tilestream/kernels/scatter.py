@@ -40,6 +40,13 @@ def mix(z):  # type: ignore[no-untyped-def]
     return z ^ (z >> np.uint64(31))
 
 
+@njit(nogil=True, inline="always")
+def point_hash(x, y, z):  # type: ignore[no-untyped-def]
+    """A 64-bit hash of three int64."""
+    key = mix(np.uint64(x) * SPLITMIX + np.uint64(y))
+    return mix(key * SPLITMIX + np.uint64(z))
+
+
 @njit(nogil=True, error_model="numpy")
 def tile_bounds(points_mm, tile_mm):  # type: ignore[no-untyped-def]
     """The lowest and highest tile index of the points, as (ix_lo, iy_lo, ix_hi, iy_hi)."""
@@ -107,7 +114,20 @@ def group_by_tile(points_mm, tile_of, tile_mm, ix_lo, iy_lo, rows, next_row, out
         out[row, 0] = x
         out[row, 1] = y
         out[row, 2] = z
-        key = mix(np.uint64(x) * SPLITMIX + np.uint64(y))
-        key = mix(key * SPLITMIX + np.uint64(z))
+        key = point_hash(x, y, z)
         prints[tile, 0] += key
         prints[tile, 1] += mix(key + SPLITMIX)
+
+
+@njit(nogil=True, error_model="numpy")
+def add_print(points, found):  # type: ignore[no-untyped-def]
+    """Add the fingerprint of points to another: as `group_by_tile` makes it.
+
+    Args:
+        points: (n, 3) int32 [mm from the tile's origin].
+        found: (2,) uint64, the fingerprint is added.
+    """
+    for i in range(points.shape[0]):
+        key = point_hash(np.int64(points[i, 0]), np.int64(points[i, 1]), np.int64(points[i, 2]))
+        found[0] += key
+        found[1] += mix(key + SPLITMIX)

@@ -19,6 +19,7 @@ import skops
 import skops.io
 
 from tilestream.errors import ModelError, SourceNotFoundError
+from tilestream.files import Files
 from tilestream.model.domain import Domain
 from tilestream.model.explain import Typical
 from tilestream.model.intervals import Interval
@@ -80,9 +81,8 @@ def save_model(model: Model, path: str | os.PathLike[str]) -> None:
         },
         "typical": {name: getattr(model.typical, name) for name in TYPICAL},
     }
-    part = place.with_name(f"{place.name}.{os.getpid()}.part")
-    part.write_bytes(skops.io.dumps(content, compression=zipfile.ZIP_DEFLATED, compresslevel=6))
-    part.replace(place)
+    packed = skops.io.dumps(content, compression=zipfile.ZIP_DEFLATED, compresslevel=6)
+    Files.at(path).write(packed)
 
 
 def load_model(path: str | os.PathLike[str]) -> Model:

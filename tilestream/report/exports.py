@@ -16,8 +16,8 @@ from pyproj.exceptions import CRSError
 from tilestream.errors import CrsError
 from tilestream.factors import catalogue, observability
 from tilestream.factors.rows import PLACE_COLUMNS
+from tilestream.files import Files
 from tilestream.formats.points.pcd import write_pcd
-from tilestream.formats.points.rows import writing_whole
 from tilestream.model.features import SPREAD_ACROSS, SPREAD_ALONG, WEAK_ALONG
 from tilestream.model.training import PREDICTION_COLUMNS
 from tilestream.records import Float64
@@ -47,8 +47,7 @@ _CATALOGUE = {
 
 def write_bytes(path: Path, data: bytes) -> None:
     """Write a file that is whole or not there."""
-    with writing_whole(path) as file:
-        file.write(data)
+    Files.at(path).write(data)
 
 
 def write_text(path: Path, text: str) -> None:

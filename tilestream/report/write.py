@@ -1,5 +1,6 @@
 """Findings or a comparison in, a folder out."""
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,10 @@ from tilestream.report.summary import plain, summary
 
 THRESHOLD = 0.25
 """Estimates above this are too large [m]: the paper's, and where Autoware warns."""
+
+
+OURS = re.compile(r"(map|distribution|paths|importances|coverage|worst_\d+)\.png")
+"""What we call our figures: others of the folder are somebody else's."""
 
 
 def write_report(
@@ -121,7 +126,7 @@ def _write_figures(folder: Path, findings: Findings, worst: Mapping[int, bytes |
     files |= {f"worst_{n:02d}.png": data for n, data in worst.items() if isinstance(data, bytes)}
     for name, data in files.items():
         write_bytes(folder / name, data)
-    for old in folder.glob("*.png"):
-        if old.name not in files:
+    for old in folder.iterdir():
+        if OURS.fullmatch(old.name) and old.name not in files:
             old.unlink()
     return sorted(files)

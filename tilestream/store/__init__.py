@@ -1,18 +1,20 @@
-"""The tile store: a Zarr group per tile, a sub-group per table of a tile, a mark on what is done.
+"""The tile store: a Zarr group per tile, an array per table of a tile, a mark on what is done.
 
 ```
-map.zarr/                 attributes: schema, settings, CRS, lattice origin, sources
+map.zarr/                 attributes: schema, settings, CRS, lattice origin, sources, the manifest
+  manifest_4f.../         which tiles there must be, with the identity of each
   12_-3/                  a tile, named by its key
-    points/xyz            (3, n) int32 millimetres from the tile's origin, sorted by voxel
-    cells_2000/...        a table made from them: one array per column
+    points                (3, n) int32 millimetres from the tile's origin, sorted by voxel
+    cells_2000            a table made from them: its columns one after the other
 ```
 
-A table is written by one task: the arrays first, then, last, its mark (status, reason, identity,
-facts). Without a mark a table is missing, whatever lies there; every reader looks at the mark.
+A table is two objects, written by one task: its values, then, last, its mark (status, reason,
+identity, facts). Without a mark a table is missing, whatever lies there, and a tile that the
+manifest does not name is none; every reader looks at both. All that is read has a checksum.
 """
 
 import html
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -21,26 +23,40 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from tilestream.errors import StoreError, StoreVersionError, TileNotReadyError, UsageError
+from tilestream.errors import (
+    DamagedError,
+    IncompleteError,
+    StoreError,
+    StoreNotFoundError,
+    StoreVersionError,
+    TileNotReadyError,
+    UsageError,
+)
+from tilestream.files import Files
 from tilestream.grid import MM_PER_M, Box, TileGrid, TileKey, whole_mm
+from tilestream.lock import LOCK, writer_of
 from tilestream.marks import Mark
 from tilestream.records import Cells, Float64, Int64
+from tilestream.store.arrays import NODE as NODE
 from tilestream.store.arrays import (
-    Files,
-    create_root,
+    checked,
     erase,
     read_columns,
     read_marks,
-    read_root,
+    said_by,
     write_columns,
-    write_root,
+    write_group,
 )
+from tilestream.store.condition import Condition as Condition
+from tilestream.store.condition import State
+from tilestream.store.manifest import Manifest as Manifest
+from tilestream.store.manifest import read_manifest, remove_other_manifests
 from tilestream.store.table import CELLS_VERSION as CELLS_VERSION
 from tilestream.store.table import TileTable as TileTable
 from tilestream.store.table import cells_table as cells_table
 from tilestream.version import VERSION
 
-SCHEMA = 2
+SCHEMA = 3
 """Version of the store's layout; a store with another one is refused."""
 POINTS = "points"
 """Name of the table that ingest writes: the column `xyz`."""
@@ -77,7 +93,7 @@ class Tile:
 
         Args:
             halo: also those of the neighbours within the store's halo, corners included;
-                a neighbour that does not exist has none.
+                a neighbour that the map does not have has none.
 
         Raises:
             TileNotReadyError: the tile (or, with halo, an existing neighbour) is not done.
@@ -118,7 +134,9 @@ class Tile:
             TileNotReadyError: the tile, or one in reach that exists, is not done; says why.
         """
         grid = self.store.grid
-        near = list(grid.keys_over(grid.core(self.key).grown(table.points_reach_mm)))
+        near = [
+            t.key for t in self.store.tiles_over(grid.core(self.key).grown(table.points_reach_mm))
+        ]
         marks = self.store._marks([*((k, POINTS) for k in near), (self.key, table.name)])
         *points, mark = marks
         have = {k: m.identity for k, m in zip(near, points, strict=True) if m.status == "done"}
@@ -135,8 +153,11 @@ class Tile:
 
         Raises:
             TileNotReadyError: it is not; says its status and why.
+            DamagedError: its mark is not what was written.
         """
         mark = self.mark(table)
+        if mark.status == "damaged":
+            raise DamagedError(mark.reason)
         if mark.status != "done":
             raise TileNotReadyError(
                 f"{self.store.url}: {table} of tile {self.key} is {mark.status}: {mark.reason}"
@@ -148,26 +169,33 @@ class Tile:
 
         Raises:
             TileNotReadyError: the table is not done.
-            StoreError: a column of a done table was lost or damaged since.
+            DamagedError: it was lost or damaged since.
         """
-        columns: list[str] = self.require(table).facts["columns"]
-        return read_columns(self.store.files, f"{self.key}/{table}", columns)
+        self.require(table)
+        return read_columns(self.store.files, f"{self.key}/{table}")
 
     def write_table(self, table: str, columns: Mapping[str, NDArray[Any]], mark: Mark) -> None:
         """Replace a table: the old mark goes first, the new one comes last.
 
         Args:
             table: its name.
-            columns: an array per column, each written as one chunk.
+            columns: an array per column.
             mark: of status `done`; the names of the columns are added to its facts.
         """
+        files = self.store.files
+        if table == POINTS and not files.under(f"{self.key}/{NODE}").there():
+            files.under(str(self.key)).remove_parts()
+            write_group(files.under(str(self.key)), {"tile": str(self.key)})
+        erase(files, f"{self.key}/{table}")
+        write_columns(files, f"{self.key}/{table}", columns, mark)
+
+    def erase(self, table: str) -> None:
+        """Remove a table, if it is there: its mark first."""
         erase(self.store.files, f"{self.key}/{table}")
-        write_columns(self.store.files, f"{self.key}/{table}", columns, mark)
 
     def write_reason(self, table: str, mark: Mark) -> None:
         """Replace a table by the reason why there is none (`failed` or `skipped`)."""
-        erase(self.store.files, f"{self.key}/{table}")
-        write_columns(self.store.files, f"{self.key}/{table}", {}, mark)
+        self.write_table(table, {}, mark)
 
 
 class TileStore:
@@ -189,16 +217,6 @@ class TileStore:
         return Files.at(self.url)
 
     @property
-    def fs(self) -> Any:
-        """The fsspec filesystem that the store is on."""
-        return self.files.fs
-
-    @property
-    def root(self) -> str:
-        """The store's path on that filesystem."""
-        return self.files.root
-
-    @property
     def address(self) -> str:
         """The store's URL; of a local store its absolute path, for readers started elsewhere."""
         return self.url if "://" in self.url else str(Path(self.url).absolute())
@@ -208,7 +226,7 @@ class TileStore:
 
     @classmethod
     def create(cls, url: str, settings: StoreSettings) -> Self:
-        """A new, empty store.
+        """A new, empty store, whose tiles are not known yet.
 
         Raises:
             StoreError: something that is no tile store lies at `url`.
@@ -217,51 +235,82 @@ class TileStore:
         store = cls(url, settings)
         if settings.map_leaf:
             store.grid.require_cell_size(whole_mm(settings.map_leaf, "map_leaf"))
-        if store.fs.exists(store.root) and store.fs.ls(store.root, detail=False):
+        if set(store.files.names()) - {LOCK}:
             raise StoreError(f"{url} is there and is no tile store: choose another path")
-        create_root(store.url, store._attributes([], {}))
+        store._write("being written", None, [], {})
         return store
 
-    def _attributes(
-        self, sources: list[dict[str, Any]], made_by: Mapping[str, int]
-    ) -> dict[str, Any]:
-        return {
+    def _write(
+        self,
+        state: State,
+        manifest: str | None,
+        sources: Sequence[Mapping[str, Any]],
+        made_by: Mapping[str, int],
+    ) -> None:
+        said = {
             "schema": SCHEMA,
             "lattice_origin": [0.0, 0.0, 0.0],
             "settings": asdict(self.settings),
-            "sources": sources,
+            "state": state,
+            "manifest": manifest,
+            "sources": list(sources),
             "made_by": dict(made_by),
         }
+        write_group(self.files, said)
+        self.files.remove_parts()
+        remove_other_manifests(self.files, manifest)
+        self.__dict__.pop("manifest", None)  # the one that was read before
 
     def sources(self) -> list[dict[str, Any]]:
         """What the map was made from: path, format, size, points, fingerprint of each source.
 
         Empty until an ingest has ended.
         """
-        found: list[dict[str, Any]] = _known(self.files)["sources"]
+        found: list[dict[str, Any]] = _known(self.url)["sources"]
         return found
 
     def made_by(self) -> dict[str, int]:
         """The stages that made the map, with their versions; empty until an ingest has ended."""
-        found: dict[str, int] = _known(self.files)["made_by"]
+        found: dict[str, int] = _known(self.url)["made_by"]
         return found
 
-    def write_sources(self, sources: list[dict[str, Any]], made_by: Mapping[str, int]) -> None:
+    @cached_property
+    def manifest(self) -> Manifest | None:
+        """Which tiles the map must have; None: that is not known yet."""
+        name = _known(self.url)["manifest"]
+        return None if name is None else read_manifest(self.files, name)
+
+    def begin(self, manifest: Manifest) -> None:
+        """Write down which tiles the map will have; until `end` it is being written.
+
+        Tiles that it has and will not have are removed, with all their tables. The one writer of
+        this and of `end` is the process that runs the ingest.
+        """
+        had = self.manifest
+        for key in [] if had is None else had.identities:
+            if key not in manifest:
+                self.remove(key)
+        said = _known(self.url)
+        name = manifest.write(self.files)
+        self._write("being written", name, said["sources"], said["made_by"])
+
+    def end(self, sources: Sequence[Mapping[str, Any]], made_by: Mapping[str, int]) -> None:
         """Record what the map was made from, and by which versions of the stages.
 
-        The one writer is the process that ran the ingest.
+        A map whose tiles were never known is not whole by that.
         """
-        write_root(self.files, self._attributes(sources, made_by))
+        name = _known(self.url)["manifest"]
+        self._write("being written" if name is None else "whole", name, sources, made_by)
+
+    def forget(self) -> None:
+        """Say that it is not known which tiles the map must have: its ingest finds out again."""
+        said = _known(self.url)
+        self._write("being written", None, said["sources"], said["made_by"])
 
     def remove(self, key: TileKey) -> None:
         """Remove a tile with all its tables; the mark of its points goes first."""
         erase(self.files, f"{key}/{POINTS}")
-        self.fs.rm(f"{self.root}/{key}", recursive=True)
-
-    def remove_fragments(self) -> None:
-        """Remove what an ingest left between its two halves."""
-        if self.fs.exists(f"{self.root}/fragments"):
-            self.fs.rm(f"{self.root}/fragments", recursive=True)
+        self.files.under(str(key)).remove()
 
     def keys(self, table: str = POINTS) -> list[TileKey]:
         """The tiles of which a table is done, sorted."""
@@ -270,8 +319,11 @@ class TileStore:
     def marks(
         self, table: str = POINTS, keys: Iterable[TileKey] | None = None
     ) -> dict[TileKey, Mark]:
-        """What became of a table in some tiles, in their order; None: in every tile, sorted."""
-        wanted = sorted(self._tile_folders()) if keys is None else list(keys)
+        """What became of a table in some tiles, in their order; None: in every tile that the map
+        must have, sorted.
+        """
+        every = () if self.manifest is None else self.manifest.identities
+        wanted = list(every if keys is None else keys)
         return dict(zip(wanted, self._marks([(key, table) for key in wanted]), strict=True))
 
     def identities(self) -> dict[TileKey, str]:
@@ -279,15 +331,33 @@ class TileStore:
         marks = self.marks()
         return {key: mark.identity for key, mark in marks.items() if mark.status == "done"}
 
-    def _tile_folders(self) -> Iterable[TileKey]:
-        for entry in self.fs.ls(self.root, detail=False):
-            try:
-                yield TileKey.parse(str(entry).rstrip("/").rsplit("/", 1)[-1])
-            except UsageError:
-                continue
-
     def _marks(self, wanted: list[tuple[TileKey, str]]) -> list[Mark]:
-        return read_marks(self.files, [f"{key}/{table}" for key, table in wanted])
+        found = read_marks(self.files, [f"{key}/{table}" for key, table in wanted])
+        return [
+            self._as_promised(key, mark) if table == POINTS else mark
+            for (key, table), mark in zip(wanted, found, strict=True)
+        ]
+
+    def _as_promised(self, key: TileKey, mark: Mark) -> Mark:
+        """The mark of a tile's points, as far as the manifest knows of it."""
+        if self.manifest is None:
+            return Mark("missing", "the map is being made, its tiles are not known yet")
+        if key not in self.manifest:
+            return Mark("missing", "the map has no such tile")
+        if mark.status == "missing":
+            return Mark("missing", "not written yet, or lost")
+        if mark.status == "done" and mark.identity != self.manifest.identities[key]:
+            return Mark("missing", "there is one of an older map")
+        return mark
+
+    def condition(self) -> Condition:
+        """Whether the map is whole, being written, or damaged."""
+        return Condition(self.url, self.state(), self.marks(), writer_of(self.url))
+
+    def state(self) -> State:
+        """Whether the ingest that makes the map has ended."""
+        found: State = _known(self.url)["state"]
+        return found
 
     def tile(self, key: tuple[int, int]) -> Tile:
         """The tile of a key `(ix, iy)`.
@@ -311,7 +381,8 @@ class TileStore:
             cell_size: edge of a cell [m].
 
         Raises:
-            TileNotReadyError: a tile in the box failed or was skipped; says why.
+            TileNotReadyError: a tile in the box is missing, failed or was skipped; says why.
+            IncompleteError: it is not known yet which tiles there are.
             UsageError: as `Tile.cells`.
         """
         cell_mm = whole_mm(cell_size, "cell_size")
@@ -326,10 +397,11 @@ class TileStore:
         )
 
     def points_in(self, box: Box) -> Int64:
-        """(n, 3) the map points in a box [mm, map frame]; tiles that do not exist have none.
+        """(n, 3) the map points in a box [mm, map frame]; there are none where the map has no tile.
 
         Raises:
-            TileNotReadyError: a tile in the box failed or was skipped; says why.
+            TileNotReadyError: a tile in the box is missing, failed or was skipped; says why.
+            IncompleteError: it is not known yet which tiles there are.
         """
         parts = [np.zeros((0, 3), np.int64)]
         for tile in self.tiles_over(box):
@@ -338,14 +410,14 @@ class TileStore:
         return np.concatenate(parts)
 
     def tiles_over(self, box: Box) -> list[Tile]:
-        """The tiles that a box touches and that exist, done or not."""
-        keys = list(self.grid.keys_over(box))
-        marks = self._marks([(key, POINTS) for key in keys])
-        return [
-            Tile(self, key)
-            for key, mark in zip(keys, marks, strict=True)
-            if mark.status != "missing"
-        ]
+        """The tiles that a box touches and that the map must have, done or not.
+
+        Raises:
+            IncompleteError: it is not known yet which those are.
+        """
+        if self.manifest is None:
+            raise IncompleteError(f"{self.url} is being made: its tiles are not known yet")
+        return [Tile(self, key) for key in self.grid.keys_over(box) if key in self.manifest]
 
     def __repr__(self) -> str:
         counts = [m.facts["points"] for m in self.marks().values() if m.status == "done"]
@@ -367,29 +439,41 @@ class TileStore:
 
 
 def open_store(url: str) -> TileStore:
-    """Open a tile store that `ingest` made.
+    """Open a tile store that `ingest` made, or is making (`TileStore.condition`).
 
     Args:
         url: a local path, or any fsspec URL.
 
     Raises:
         StoreNotFoundError: nothing there.
-        StoreVersionError: written by a newer version of tilestream.
+        StoreVersionError: written by another version of tilestream.
+        DamagedError: the store's own record is not what was written.
         StoreError: something else lies there.
         UsageError: a file lies there, or where a folder above it would be.
     """
-    attributes = _known(Files.at(str(url)))
-    return TileStore(str(url), StoreSettings(**attributes["settings"]))
+    return TileStore(str(url), StoreSettings(**_known(str(url))["settings"]))
 
 
-def _known(files: Files) -> dict[str, Any]:
+def _known(url: str) -> dict[str, Any]:
     """What a store says of itself; errors as of `open_store`."""
-    attributes = read_root(files)
-    schema = int(attributes["schema"])
+    root = Files.at(url).under(NODE)
+    try:
+        text = root.read()
+        schema = int(said_by(text)["schema"])
+    except FileNotFoundError:
+        raise StoreNotFoundError(
+            f"no tile store at {url}: make one with `tilestream ingest SOURCES --store {url}`"
+        ) from None
+    except NotADirectoryError:
+        raise UsageError(
+            f"{url} is a file, or below one, and a tile store is a folder: name another path"
+        ) from None
+    except (KeyError, ValueError, TypeError) as error:
+        raise StoreError(f"{root.root} is damaged, or of no tile store: {error}") from error
     if schema != SCHEMA:
         what = "install the newer tilestream" if schema > SCHEMA else "give another path"
         raise StoreVersionError(
-            f"{files.url} has schema {schema}, this is tilestream {VERSION} with schema {SCHEMA}: "
+            f"{url} has schema {schema}, this is tilestream {VERSION} with schema {SCHEMA}: "
             f"{what}, or remove it and ingest the sources again"
         )
-    return attributes
+    return checked(text, root.root)

@@ -1,153 +1,165 @@
-"""Arrays, marks and the root of a tile store, as Zarr keeps them."""
+"""Arrays and marks of a tile store, as Zarr keeps them: two objects a table, each with a checksum.
+
+A table is one array: its columns' values one after the other, of the columns' own type where all
+have the same, else as bytes. The array's `zarr.json` holds the mark, which says where each column
+is, and comes last: without it there is no table.
+"""
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from functools import cached_property
-from typing import Any, Self
+from dataclasses import asdict
+from typing import Any
 
-import fsspec
 import numpy as np
 import zarr
 from numpy.typing import NDArray
-from zarr.codecs import BloscCodec
+from zarr.codecs import BloscCodec, Crc32cCodec
+from zarr.core.buffer import cpu
+from zarr.storage import MemoryStore
 
-from tilestream.errors import StoreError, StoreNotFoundError, UsageError
-from tilestream.marks import MISSING, Mark
+from tilestream.errors import DamagedError
+from tilestream.files import Files
+from tilestream.marks import AGAIN, MISSING, SEAL, Mark, sealed, unsealed
 
-_CODEC = BloscCodec(cname="zstd", clevel=3, shuffle="bitshuffle")
 _OURS = "tilestream"
-"""The attribute of a group that is ours."""
+"""The attribute of a Zarr node that is ours."""
+NODE, CHUNK = "zarr.json", "c/0"
+"""The two objects of a table."""
 
 
-@dataclass(frozen=True)
-class Files:
-    """Where a store lies."""
-
-    url: str
-    """As it was given: a path, or any fsspec URL."""
-    fs: Any
-    """The fsspec filesystem."""
-    root: str
-    """The store's path on it."""
-
-    @classmethod
-    def at(cls, url: str) -> Self:
-        """The place that a URL names."""
-        fs, root = fsspec.core.url_to_fs(url)
-        fs.use_listings_cache = False
-        return cls(url, fs, str(root).rstrip("/"))
-
-    @cached_property
-    def zarr(self) -> Any:
-        """The place as Zarr opens it."""
-        return zarr.open_group(self.url, mode="r+").store
+def write_group(files: Files, attributes: Mapping[str, Any]) -> None:
+    """Write a Zarr group of ours: whole, or as it was."""
+    kept: dict[str, Any] = {}
+    zarr.open_group(MemoryStore(kept), mode="w")
+    _write_node(files, kept, attributes)
 
 
-def create_root(url: str, attributes: Mapping[str, Any]) -> None:
-    """Make an empty store."""
-    zarr.open_group(url, mode="w", attributes={_OURS: dict(attributes)})
-
-
-def write_root(files: Files, attributes: Mapping[str, Any]) -> None:
-    """Replace what a store says of itself."""
-    zarr.open_group(files.zarr, mode="r+").attrs[_OURS] = dict(attributes)
-
-
-def read_root(files: Files) -> dict[str, Any]:
-    """What a store says of itself: `schema`, `settings`, `sources`, `made_by`.
+def said_by(text: bytes) -> dict[str, Any]:
+    """What the text of a node says of ours, its checksum not looked at.
 
     Raises:
-        StoreNotFoundError: nothing there.
-        StoreError: something else lies there.
-        UsageError: a file lies there, or where a folder above it would be.
+        ValueError: it is no node of ours.
     """
     try:
-        text = files.fs.cat_file(f"{files.root}/zarr.json")
-    except FileNotFoundError:
-        url = files.url
-        raise StoreNotFoundError(
-            f"no tile store at {url}: make one with `tilestream ingest SOURCES --store {url}`"
-        ) from None
-    except NotADirectoryError:
-        raise UsageError(
-            f"{files.url} is a file, or below one, and a tile store is a folder: name another path"
-        ) from None
+        return dict(json.loads(text)["attributes"][_OURS])
+    except (KeyError, TypeError) as error:
+        raise ValueError("no node of tilestream") from error
+
+
+def checked(text: bytes, where: str) -> dict[str, Any]:
+    """What the text of a node says of ours.
+
+    Raises:
+        DamagedError: it is not what was written.
+    """
     try:
-        attributes: dict[str, Any] = json.loads(text)["attributes"][_OURS]
-        int(attributes["schema"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise StoreError(f"{files.url} is a Zarr group but no tile store of tilestream") from error
-    return attributes
+        ours = said_by(text)
+        node = {**json.loads(text), "attributes": {}, _OURS: ours}
+        return dict(unsealed({**node, SEAL: ours.pop(SEAL, None)})[_OURS])
+    except ValueError as error:
+        raise DamagedError(f"{where} is damaged ({error}): {AGAIN}") from error
 
 
 def read_marks(files: Files, tables: Sequence[str]) -> list[Mark]:
-    """The marks of tables, `TILE/TABLE` each, in one request; `missing` where there is none."""
-    if not tables:
-        return []
-    paths = [f"{files.root}/{table}/zarr.json" for table in tables]
-    texts = files.fs.cat(paths, on_error="omit")
-    by_end = {"/".join(str(path).split("/")[-3:-1]): text for path, text in texts.items()}
-    return [_parse_mark(by_end.get(table)) for table in tables]
-
-
-def _parse_mark(text: bytes | None) -> Mark:
-    if text is None:
-        return MISSING
-    known = json.loads(text).get("attributes", {}).get(_OURS)
-    return Mark(**known) if known else MISSING
-
-
-def read_columns(files: Files, table: str, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Some columns of a table, `TILE/TABLE`, by name.
+    """The marks of tables, `TILE/TABLE` each, in one request; `missing` where there is none, and
+    `damaged` where it is not what was written.
 
     Raises:
-        StoreError: one was lost or damaged.
+        OSError: one cannot be read.
     """
-    found = {}
-    for name in columns:
-        path = f"{table}/{name}"
-        try:
-            column = np.asarray(zarr.open_array(files.zarr, path=path, mode="r")[...])
-        except (FileNotFoundError, KeyError, ValueError, RuntimeError) as error:
-            raise StoreError(
-                f"{files.url}/{path} cannot be read ({error}): "
-                f"delete the folder {table} and run the same command again"
-            ) from error
-        chunk = "/".join(["c", *("0" for _ in column.shape)])  # of a lost one, zeros are read
-        if column.size and not files.fs.exists(f"{files.root}/{path}/{chunk}"):
-            raise StoreError(
-                f"{files.url}/{path} has lost a chunk: "
-                f"delete the folder {table} and run the same command again"
-            )
-        found[name] = column
-    return found
+    texts = files.read_all([f"{table}/{NODE}" for table in tables])
+    return [_mark(text, f"{files.root}/{t}/{NODE}") for text, t in zip(texts, tables, strict=True)]
+
+
+def _mark(text: bytes | None, where: str) -> Mark:
+    try:
+        return MISSING if text is None else Mark(**checked(text, where))
+    except DamagedError as error:
+        return Mark("damaged", str(error))
+
+
+def read_columns(files: Files, table: str) -> dict[str, NDArray[Any]]:
+    """The columns of a table, `TILE/TABLE`, by name.
+
+    Raises:
+        DamagedError: it was lost in part, or is not what was written.
+        OSError: it cannot be read.
+    """
+    where = f"{files.root}/{table}"
+    node, chunk = files.read_all([f"{table}/{NODE}", f"{table}/{CHUNK}"])
+    mark = _mark(node, f"{where}/{NODE}")
+    if mark.status != "done":
+        raise DamagedError(f"{where} is {mark.status}: {mark.reason}")
+    columns: Mapping[str, tuple[str, list[int]]] = mark.facts["columns"]
+    if chunk is None and any(0 not in shape for _, shape in columns.values()):
+        raise DamagedError(f"{where}/{CHUNK} is lost: {AGAIN}")
+    kept: dict[str, Any] = {
+        name: cpu.Buffer.from_bytes(b) for name, b in ((NODE, node), (CHUNK, chunk)) if b
+    }
+    try:
+        packed = np.asarray(zarr.open_array(MemoryStore(kept), mode="r")[...])
+        return _unpacked(packed, columns)
+    except (ValueError, RuntimeError, TypeError) as error:
+        raise DamagedError(f"{where}/{CHUNK} is damaged ({error}): {AGAIN}") from error
 
 
 def write_columns(
     files: Files, table: str, columns: Mapping[str, NDArray[Any]], mark: Mark
 ) -> None:
-    """Write a table, `TILE/TABLE`, where none is: each column as one chunk, last the mark."""
-    for name, column in columns.items():
-        array = zarr.create_array(
-            files.zarr,
-            name=f"{table}/{name}",
-            shape=column.shape,
-            chunks=tuple(max(1, n) for n in column.shape),
-            dtype=column.dtype,
-            compressors=_CODEC,
-            config={"write_empty_chunks": True},
-        )
-        array[...] = column
-    known = asdict(mark)
-    known["facts"] = {**mark.facts, "columns": list(columns)}
-    zarr.open_group(files.zarr, path=table, mode="a").attrs[_OURS] = known
+    """Write a table, `TILE/TABLE`, where none is: its values, last the mark."""
+    packed = _packed(columns)
+    kept: dict[str, Any] = {}
+    array = zarr.create_array(
+        MemoryStore(kept),
+        shape=packed.shape,
+        chunks=(max(1, packed.size),),
+        dtype=packed.dtype,
+        compressors=[_codec(columns), Crc32cCodec()],
+        config={"write_empty_chunks": True},
+    )
+    array[...] = packed
+    shapes = {name: [column.dtype.str, list(column.shape)] for name, column in columns.items()}
+    facts = {**mark.facts, "columns": shapes}
+    if CHUNK in kept:
+        files.under(f"{table}/{CHUNK}").write(kept[CHUNK].to_bytes())
+    _write_node(files.under(table), kept, asdict(mark) | {"facts": facts})
 
 
 def erase(files: Files, table: str) -> None:
     """Remove a table, `TILE/TABLE`, if it is there: its mark first."""
-    folder = f"{files.root}/{table}"
-    if files.fs.exists(folder):
-        if files.fs.exists(f"{folder}/zarr.json"):
-            files.fs.rm(f"{folder}/zarr.json")
-        files.fs.rm(folder, recursive=True)
+    files.under(f"{table}/{NODE}").remove()
+    files.under(table).remove()
+
+
+def _write_node(files: Files, kept: Mapping[str, Any], ours: Mapping[str, Any]) -> None:
+    """Write a node's `zarr.json`; the checksum in it is of all of it."""
+    node = {**json.loads(kept[NODE].to_bytes()), "attributes": {}}
+    seal = sealed({**node, _OURS: ours})[SEAL]
+    node["attributes"] = {_OURS: {**ours, SEAL: seal}}
+    files.under(NODE).write(json.dumps(node, indent=1).encode())
+
+
+def _codec(columns: Mapping[str, NDArray[Any]]) -> BloscCodec:
+    """Bits of values are shuffled by the widest type, whatever the array calls them."""
+    width = max((column.dtype.itemsize for column in columns.values()), default=1)
+    return BloscCodec(typesize=width, cname="zstd", clevel=3, shuffle="bitshuffle")
+
+
+def _packed(columns: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
+    """Values one after the other, the widest first, so that each lies where its type may lie."""
+    types = {column.dtype for column in columns.values()}
+    kind = types.pop() if len(types) == 1 else np.dtype(np.uint8)
+    ordered = sorted(columns.values(), key=lambda column: -column.dtype.itemsize)
+    flat = [np.ascontiguousarray(column).reshape(-1).view(kind) for column in ordered]
+    return np.concatenate([np.zeros(0, kind), *flat])
+
+
+def _unpacked(
+    packed: NDArray[Any], columns: Mapping[str, tuple[str, list[int]]]
+) -> dict[str, NDArray[Any]]:
+    found, start = dict.fromkeys(columns, packed), 0
+    for name, (kind, shape) in sorted(columns.items(), key=lambda c: -np.dtype(c[1][0]).itemsize):
+        size = int(np.prod(shape)) * np.dtype(kind).itemsize // packed.dtype.itemsize
+        found[name] = packed[start : start + size].view(kind).reshape(shape)
+        start += size
+    return found

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tilestream.errors import UsageError
+from tilestream.files import Files
 from tilestream.records import Float64, Scan, Trajectory
 
 CHUNK_BYTES = 2 * 2**20
@@ -178,7 +179,7 @@ def write_log(
             for i, stamp in enumerate(track.stamps_ns)
         )
     )
-    with Path(path).open("wb") as stream:
+    with Files.at(path).writing() as stream:
         log = _Messages(stream)
 
         def write_poses(until_ns: float) -> None:

@@ -23,6 +23,7 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from tilestream.errors import CorruptSourceError, CrsError, UsageError
+from tilestream.files import Files
 from tilestream.formats.base import Block, SourceInfo, Span
 from tilestream.formats.points.rows import (
     BinaryRows,
@@ -33,7 +34,6 @@ from tilestream.formats.points.rows import (
     finite_block,
     steps,
     whole_span,
-    writing_whole,
 )
 from tilestream.formats.registry import Format
 
@@ -315,7 +315,7 @@ def write_las(path: str | os.PathLike[str], points: ArrayLike, *, crs: str | Non
         header.add_crs(_read_crs(crs))
     record = laspy.ScaleAwarePointRecord.zeros(len(table), header=header)
     record["X"], record["Y"], record["Z"] = np.rint((table - header.offsets) / _SCALE).T
-    with writing_whole(path) as file:
+    with Files.at(path).writing() as file:
         packed = Path(path).suffix.lower() == ".laz"
         backend = laspy.LazBackend.Lazrs if packed else None
         with laspy.LasWriter(

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tilestream.errors import CorruptSourceError, UsageError
+from tilestream.files import Files
 from tilestream.formats.base import Block, SourceInfo, Span
 from tilestream.formats.points.rows import (
     BinaryRows,
@@ -31,7 +32,6 @@ from tilestream.formats.points.rows import (
     steps,
     table_of,
     whole_span,
-    writing_whole,
 )
 from tilestream.formats.projector import crs_beside
 from tilestream.formats.registry import Format
@@ -342,7 +342,7 @@ def write_pcd(
         data = _packed(b"".join(table[name].tobytes() for name in table.dtype.names or ()))
     else:
         raise UsageError(f"encoding {encoding!r}: give ascii, binary or binary_compressed")
-    with writing_whole(path) as file:
+    with Files.at(path).writing() as file:
         file.write(_header_of(table, encoding))
         file.write(data)
 

@@ -1,14 +1,12 @@
 """Points that lie row by row in a file, binary or as text, and what reading them has in common."""
 
 import math
-import os
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice, pairwise
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -355,19 +353,3 @@ def as_text(table: NDArray[Any]) -> bytes:
     """A line per point; every number in the fewest digits that read back the same."""
     columns = [table[name].astype(str) for name in table.dtype.names or ()]
     return "".join(f"{' '.join(row)}\n" for row in zip(*columns, strict=True)).encode()
-
-
-@contextmanager
-def writing_whole(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """A file to write that takes its name only once it is whole; nothing is left if that fails."""
-    target = Path(path)
-    part = target.with_name(f".{target.name}.{os.getpid()}.part")
-    try:
-        with part.open("wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(target)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise

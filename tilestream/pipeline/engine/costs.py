@@ -8,6 +8,7 @@ import os
 from collections.abc import Collection, Iterable
 from pathlib import Path
 
+from tilestream.files import Files
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.stage import Task
 
@@ -47,10 +48,7 @@ def learn(tasks: Collection[Task], outcomes: Iterable[Outcome]) -> None:
             known[stage] = (known.get(stage, shipped[stage]) + fresh) / 2.0
     place = calibration_file()
     try:
-        place.parent.mkdir(parents=True, exist_ok=True)
-        part = place.with_name(f"{place.name}.{os.getpid()}.part")
-        part.write_text(json.dumps(known, indent=2, sort_keys=True))
-        part.replace(place)
+        Files.at(place).write(json.dumps(known, indent=2, sort_keys=True).encode())
     except OSError:
         return
 

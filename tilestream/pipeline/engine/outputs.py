@@ -103,6 +103,10 @@ class Parquet:
         write_table(self.path, made.value, columns, Mark("done", identity=identity, facts=facts))
         return {"rows": len(made.value)}
 
-    def read(self) -> Stored:
+    def files(self, identity: str) -> dict[str, str]:
+        """What a task of this identity writes: the identity of each file, by path."""
+        return {self.path: identity}
+
+    def read(self) -> Any:
         """The rows, and the facts of the mark."""
         return Stored(read_tables([self.path]), read_mark(self.path).facts)

@@ -10,9 +10,10 @@ from tilestream.errors import PartialError
 from tilestream.factors.catalogue import Which
 from tilestream.factors.rows import Samples, in_route_order, samples_by_tile
 from tilestream.grid import TileKey, whole_mm
-from tilestream.pipeline.engine.executor import Watch, execute
+from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, paths_of
 from tilestream.pipeline.engine.stage import Stage
+from tilestream.pipeline.jobs.inventory import make_tables
 from tilestream.pipeline.stages.factors import Looking, factors, factors_task
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.observe import Observing, observe, observe_task
@@ -20,7 +21,7 @@ from tilestream.records import Route
 from tilestream.sensor import VLP16, Carrier, Sensor
 from tilestream.settings import LabelSettings, RegistrationSettings, VirtualSettings
 from tilestream.store import TileStore
-from tilestream.tables import read_tables, remove_others
+from tilestream.tables import read_tables
 
 SENSOR_HEIGHT = 2.0
 """Height of the lidar above the road [m] (the paper's vehicle)."""
@@ -39,6 +40,7 @@ def factors_along(
     client: Any | None = None,
     memory: int = DEFAULT_MEMORY,
     watch: Watch | None = None,
+    partial: bool = False,
 ) -> pd.DataFrame:
     """The factors of sample points along routes, tile by tile, resumable, in parallel.
 
@@ -56,6 +58,7 @@ def factors_along(
         client: a Dask client to run on; None: this process.
         memory: what a task may use [bytes].
         watch: is told of each task that ended.
+        partial: go on with a map that is not whole; rows that could see what is missing say so.
 
     Returns:
         A row per sample point, route by route and along each; `status` and `reason` say where
@@ -63,14 +66,16 @@ def factors_along(
 
     Raises:
         UsageError: no routes, two of one name, settings that cannot be.
+        IncompleteError: the map is not whole, and not `partial`.
+        LockedError: another process writes to the folder.
         PlanError: a task does not fit `memory`.
         PartialError: some tasks failed; the message lists them, the rest is done.
     """
     routes = list(routes)
     looking = Looking(sensor, cell_size, which, sensor_height)
     samples = samples_by_tile(store.grid, routes, spacing)
-    plan = plan_factors(MapPlan.of_store(store), samples, out, looking, memory)
-    return _tables_of(plan, factors.name, routes, client, watch)
+    plan = plan_factors(MapPlan.of_store(store, partial=partial), samples, out, looking, memory)
+    return _tables_of(plan, factors.name, out, routes, client, watch)
 
 
 def plan_factors(
@@ -109,6 +114,7 @@ def observe_along(
     client: Any | None = None,
     memory: int = DEFAULT_MEMORY,
     watch: Watch | None = None,
+    partial: bool = False,
 ) -> pd.DataFrame:
     """Observability of sample points along routes, tile by tile, resumable, in parallel.
 
@@ -127,6 +133,7 @@ def observe_along(
         client: a Dask client to run on; None: this process.
         memory: what a task may use [bytes].
         watch: is told of each task that ended.
+        partial: go on with a map that is not whole; rows that could see what is missing say so.
 
     Returns:
         A row per sample point, route by route and along each: place, the columns of the criterion,
@@ -134,6 +141,8 @@ def observe_along(
 
     Raises:
         UsageError: no routes, two of one name, settings that cannot be.
+        IncompleteError: the map is not whole, and not `partial`.
+        LockedError: another process writes to the folder.
         PlanError: a task does not fit `memory`.
         PartialError: some tasks failed; the message lists them, the rest is done.
     """
@@ -146,8 +155,8 @@ def observe_along(
         sensor_height,
     )
     samples = samples_by_tile(store.grid, routes, spacing)
-    plan = plan_observe(MapPlan.of_store(store), samples, out, observing, memory)
-    return _tables_of(plan, observe.name, routes, client, watch)
+    plan = plan_observe(MapPlan.of_store(store, partial=partial), samples, out, observing, memory)
+    return _tables_of(plan, observe.name, out, routes, client, watch)
 
 
 def plan_observe(
@@ -180,17 +189,21 @@ def plan_observe(
 
 
 def _tables_of(
-    plan: Plan, stage: str, routes: Sequence[Route], client: Any | None, watch: Watch | None
+    plan: Plan,
+    stage: str,
+    out: str | os.PathLike[str],
+    routes: Sequence[Route],
+    client: Any | None,
+    watch: Watch | None,
 ) -> pd.DataFrame:
     """Run a plan, and read the tables of a stage; others beside them are removed.
 
     Raises:
         PartialError: some of its tasks failed; lists them.
     """
+    failed, own = make_tables(plan, out, client, watch), {task.key for task in plan.outputs(stage)}
+    failures = {key: reason for key, reason in failed.items() if key in own}
     tables = paths_of(plan.outputs(stage))
-    remove_others(tables)
-    outcomes = execute(plan, client, watch)
-    failures = {o.key: o.reason for o in outcomes if not o.ok and o.stage == stage}
     if failures:
         folder = tables[0].rsplit("/", 1)[0]
         raise PartialError(f"{folder}: {len(failures)} tasks failed, the rest is done:", failures)

@@ -85,7 +85,8 @@ def _expected_map(
     else:
         if store.sources():
             notes = ["the map is there; changed sources are read again"]
-            return MapPlan.of_store(store), (), notes
+            partial = bool(inputs.sources) or settings.map.partial
+            return MapPlan.of_store(store, partial=partial), (), notes
     plan = plan_ingest(
         inputs.sources,
         settings.store_url,

@@ -17,6 +17,7 @@ from tilestream.formats import expand_sources, open_source
 from tilestream.formats.base import SourceInfo, Span
 from tilestream.formats.logs import ScanSelection, is_log
 from tilestream.formats.registry import state_of
+from tilestream.lock import only_writer
 from tilestream.marks import hash_of
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.executor import Watch, execute
@@ -25,9 +26,15 @@ from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan
 from tilestream.pipeline.engine.stage import Task
 from tilestream.pipeline.jobs.map_crs import one_crs
 from tilestream.pipeline.stages.merge import merge, merge_tasks
-from tilestream.pipeline.stages.scatter import Fragment, SourceSpan, scatter, scatter_tasks
+from tilestream.pipeline.stages.scatter import (
+    Fragment,
+    SourceSpan,
+    fragments_of,
+    scatter,
+    scatter_tasks,
+)
 from tilestream.settings import IngestSettings
-from tilestream.store import POINTS, StoreSettings, TileStore, open_store
+from tilestream.store import Manifest, StoreSettings, TileStore, open_store
 
 POINTS_PER_TASK = 4_000_000
 """Points of a source that one scatter task reads: seconds of work, not milliseconds."""
@@ -99,15 +106,17 @@ def ingest(
     Raises:
         UsageError: settings that cannot be, or that differ from those of the existing store.
         SourceNotFoundError: a path or glob that matches nothing.
+        LockedError: another process writes to the store.
         CrsError: two sources in different CRS, or a source that is not in `crs`.
         PlanError: the job does not fit `memory`.
         PartialError: some sources or tiles failed; the message lists them with reasons, and
             the rest is done and can be opened.
     """
     settings = IngestSettings(tile_size=tile_size, halo=halo, map_leaf=map_leaf, crs=crs)
-    reading = read_sources(sources, url, settings, memory, points_topic, pose_topic, scans)
-    outcomes = execute(reading.first(), client, watch, grow=lambda o: reading.grown(o) or ())
-    failures = reading.close(outcomes)
+    with only_writer(url):
+        reading = read_sources(sources, url, settings, memory, points_topic, pose_topic, scans)
+        outcomes = execute(reading.first(), client, watch, grow=lambda o: reading.grown(o) or ())
+        failures = reading.close(outcomes)
     if failures:
         raise PartialError(
             f"{reading.store.url}: {len(failures)} sources or tiles failed, the rest is done:",
@@ -187,8 +196,15 @@ class Reading:
             raise PartialError(
                 f"{self.store.url}: no source could be read, the map is as it was:", failures
             )
-        for key in set(self.store.marks(POINTS)) - {task.tile for task in self.merges}:
-            self.store.remove(key)
+        self.store.begin(
+            Manifest.of(
+                {
+                    t.tile: (t.identity, t.counts["points"])
+                    for t in self.merges
+                    if t.tile is not None
+                }
+            )
+        )
         return self.merges
 
     def _unread(self) -> dict[str, str]:
@@ -208,7 +224,7 @@ class Reading:
         ended = {outcome.key: outcome for outcome in outcomes}
         failed = {task.key: ended[task.key].reason for task in self.merges if task.key in ended}
         failed = {key: reason for key, reason in failed.items() if reason}
-        self.store.remove_fragments()  # first, since a full disk may need the room
+        fragments_of(self.store.url).remove()  # first, since a full disk may need the room
         for task in self.merges:
             if task.key in failed and isinstance(task.writes, TileArrays):
                 task.writes.refuse(failed[task.key], task.identity)
@@ -220,8 +236,8 @@ class Reading:
         return failures
 
     def _record(self) -> None:
-        self.store.remove_fragments()
-        self.store.write_sources(
+        fragments_of(self.store.url).remove()
+        self.store.end(
             [
                 {
                     "path": source.path,
@@ -362,8 +378,7 @@ def _create_or_resume(url: str, settings: IngestSettings, found: Sequence[Source
 def _is_current(store: TileStore, found: Sequence[Source]) -> bool:
     """Whether the store is whole, and made from exactly these sources by these stages."""
     recorded = {(s["path"], s["state"]) for s in store.sources() if not s["reason"]}
-    return (
-        recorded == {(s.path, s.state) for s in found}
-        and store.made_by() == MADE_BY
-        and all(mark.status == "done" for mark in store.marks(POINTS).values())
-    )
+    if recorded != {(s.path, s.state) for s in found} or store.made_by() != MADE_BY:
+        return False
+    condition = store.condition()
+    return condition.whole and all(mark.status == "done" for mark in condition.marks.values())

@@ -14,10 +14,11 @@ from tilestream.formats.logs import ScanLog, ScanSelection
 from tilestream.grid import Box, TileKey, whole_mm
 from tilestream.kernels.fixed_order import norms
 from tilestream.label import start_poses
-from tilestream.pipeline.engine.executor import Watch, execute
+from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.engine.outputs import Parquet
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, paths_of
 from tilestream.pipeline.engine.stage import Task
+from tilestream.pipeline.jobs.inventory import make_tables
 from tilestream.pipeline.stages.drive_scans import DriveScans, Reading, Sample, opened
 from tilestream.pipeline.stages.label import label
 from tilestream.pipeline.stages.map_plan import MapPlan
@@ -25,7 +26,7 @@ from tilestream.pipeline.stages.register import MARGIN, Measuring, register
 from tilestream.records import Float64, TruePose
 from tilestream.settings import LabelSettings, RegistrationSettings, StartSettings
 from tilestream.store import TileStore
-from tilestream.tables import read_tables, remove_others
+from tilestream.tables import read_tables
 
 SCANS_PER_TASK = 8
 """Scans of a slice: about a second of work with 317 starts."""
@@ -49,6 +50,7 @@ def localize(
     client: Any | None = None,
     memory: int = DEFAULT_MEMORY,
     watch: Watch | None = None,
+    partial: bool = False,
 ) -> pd.DataFrame:
     """Localize a drive in a map from many starts per sample point: what the error there is.
 
@@ -72,6 +74,7 @@ def localize(
         client: a Dask client to run on; None: this process.
         memory: what a task may use [bytes].
         watch: is told of each task that ended.
+        partial: go on with a map that is not whole; scans that could see what is missing say so.
 
     Returns:
         A row per sample point in the order of the drive; `status` and `reason` say where none
@@ -81,11 +84,13 @@ def localize(
         UsageError: settings that cannot be, a spacing that is not positive, no scan selected.
         SourceError: the log cannot be read, has no clouds or no poses.
         TileNotReadyError: no tile of the map within reach of the drive.
+        IncompleteError: the map is not whole, and not `partial`.
+        LockedError: another process writes to the folder.
         PlanError: a task does not fit `memory`.
         PartialError: some tasks failed; the message lists them, the rest is done.
     """
     plan = plan_localize(
-        MapPlan.of_store(store),
+        MapPlan.of_store(store, partial=partial),
         replace(reading, path=os.fspath(log)) if reading else Reading(os.fspath(log)),
         out,
         cell_size=cell_size,
@@ -97,10 +102,7 @@ def localize(
         starts_per_task=starts_per_task,
         memory=memory,
     )
-    for stage in (register, label):
-        remove_others(paths_of(plan.outputs(stage.name)))
-    outcomes = execute(plan, client, watch)
-    failures = {outcome.key: outcome.reason for outcome in outcomes if not outcome.ok}
+    failures = make_tables(plan, out, client, watch)
     if failures:
         raise PartialError(f"{out}: {len(failures)} tasks failed, the rest is done:", failures)
     return read_tables(paths_of(plan.outputs(label.name)))

@@ -9,14 +9,16 @@ simulate? -> scatter -> merge, cells, terms, factors, surfels, observe, register
 
 import json
 import os
-import shutil
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
 import joblib
 import yaml
 
-from tilestream.errors import PartialError, UsageError
+from tilestream.errors import PartialError
+from tilestream.files import Files
+from tilestream.lock import only_writer
 from tilestream.model.dataset import Dataset
 from tilestream.model.file import load_model
 from tilestream.pipeline.engine.attempt import Outcome
@@ -26,7 +28,15 @@ from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.plan import Plan, paths_of
 from tilestream.pipeline.engine.stage import Task
 from tilestream.pipeline.jobs.ingest import Reading
-from tilestream.pipeline.jobs.run_book import Book, machine, told_before, write_text
+from tilestream.pipeline.jobs.inventory import announce, settle, withdraw
+from tilestream.pipeline.jobs.run_book import (
+    RECORD,
+    Book,
+    checksums,
+    machine,
+    told_before,
+    write_text,
+)
 from tilestream.pipeline.jobs.run_findings import Done, findings_of
 from tilestream.pipeline.jobs.run_inputs import (
     Inputs,
@@ -42,7 +52,6 @@ from tilestream.pipeline.stages.samples import DatasetFile
 from tilestream.report import write_report
 from tilestream.report.summary import plain
 from tilestream.store import TileStore, open_store
-from tilestream.tables import remove_others
 
 LARGE = 50_000
 """Measured places from which on a forest is grown by all workers together."""
@@ -75,10 +84,24 @@ def run(
         ModelError: a model in use that does not fit the job, before anything runs; says what
             differs.
         PlanError: a task does not fit `memory`.
+        LockedError: another process writes to the run directory, or to the map that is made.
+        IncompleteError: the map that is there is not whole, and not `map.partial`.
         PartialError: some tasks failed; the message lists them, the rest is done and reported.
     """
     settings = config if isinstance(config, RunSettings) else read_settings(config)
     check_model(settings)
+    with only_writer(settings.folder), _map_alone(settings):
+        return _run(settings, client, watch)
+
+
+def _map_alone(settings: RunSettings) -> AbstractContextManager[None]:
+    """Be the only process that writes the map, of a job that makes one."""
+    makes = settings.map.sources or settings.simulate is not None
+    return only_writer(settings.store_url) if makes else nullcontext()
+
+
+def _run(settings: RunSettings, client: Any | None, watch: Watch | None) -> Path:
+    """The whole job, of the one process that may write the run directory."""
     book = _begin(settings)
     with book.closed():
         with report_kept(client, settings.folder / "dask-performance.html"):
@@ -89,7 +112,11 @@ def run(
                 story.estimate = story.plan_estimate()
                 _estimate_large(story.estimate, client, book.listening(watch))
         learn(book.tasks, book.outcomes)
+        settle(book.tasks, book.failures)
         _report(settings, inputs, story, book)
+    book.facts["files"] = checksums(settings.folder)
+    for name in ("", "tables", "report", "report/figures"):
+        Files.at(settings.folder).under(name).remove_parts()
     book.write("failed" if book.failures else "done")
     if book.failures:
         raise PartialError(
@@ -116,15 +143,9 @@ def dataset(run_dir: str | os.PathLike[str]) -> Dataset:
 
 def _begin(settings: RunSettings) -> Book:
     """The run directory with the effective settings."""
-    try:
-        settings.folder.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError):
-        raise UsageError(
-            f"{settings.out} is a file, or below one: name another run directory"
-        ) from None
     text = yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
     write_text(settings.folder / "config.yaml", text)
-    book = Book(settings.folder, told_before(settings.folder / "run.json"))
+    book = Book(settings.folder, told_before(settings.folder / RECORD))
     book.write("running")
     return book
 
@@ -151,7 +172,8 @@ class _Story:
         tasks = self.reading.first().tasks if self.reading else ()
         if not tasks:
             self._close_map()
-            tasks = self._measured(MapPlan.of_store(self.store))
+            partial = self.settings.map.partial
+            tasks = self._measured(MapPlan.of_store(self.store, partial=partial))
         return Plan(self._known(tasks), self.settings.memory)
 
     def grown(self, outcome: Outcome) -> tuple[Task, ...]:
@@ -177,7 +199,9 @@ class _Story:
 
     def plan_estimate(self) -> Plan:
         """What is learnt and estimated from what was measured."""
-        return plan_estimate(self.settings, self.store.grid, self.measure, self.book.outcomes)
+        planned = plan_estimate(self.settings, self.store.grid, self.measure, self.book.outcomes)
+        announce(planned.tasks)
+        return planned
 
     def _close_map(self) -> None:
         """Record what the map was made from, as soon as its last tile is written."""
@@ -187,7 +211,8 @@ class _Story:
     def _measured(self, map_plan: MapPlan) -> tuple[Task, ...]:
         """The tasks that measure; tables of other settings are removed before."""
         self.measure = plan_measure(self.settings, self.inputs, map_plan)
-        _remove_other_tables(self.settings, self.measure)
+        announce(self.measure.tasks)
+        _remove_other_groups(self.settings, self.measure)
         self._open = {task.key for task in self.measure.tasks}
         return self.measure.tasks
 
@@ -196,17 +221,14 @@ class _Story:
         return tasks
 
 
-def _remove_other_tables(settings: RunSettings, measure: Plan) -> None:
-    """Remove the tables of other settings, so that two jobs are never mixed in one directory."""
-    by_folder: dict[str, list[str]] = {}
-    for path in paths_of(measure.tasks):
-        by_folder.setdefault(path.rsplit("/", 1)[0], []).append(path)
-    for paths in by_folder.values():
-        remove_others(paths)
-    for kind, tables in (("errors", ""), ("starts", ""), ("drives", "/observability")):
-        for folder in (settings.folder / "tables" / kind).glob("*/"):
-            if f"{settings.out}/tables/{kind}/{folder.name}{tables}" not in by_folder:
-                shutil.rmtree(folder)
+def _remove_other_groups(settings: RunSettings, measure: Plan) -> None:
+    """Remove the tables of drives of other settings, so that two jobs are never mixed."""
+    own = {path.rsplit("/", 1)[0] for path in paths_of(measure.tasks)}
+    for kind, below in (("errors", ""), ("starts", ""), ("drives", "/observability")):
+        for group in Files.at(f"{settings.out}/tables/{kind}").names():
+            folder = f"{settings.out}/tables/{kind}/{group}{below}"
+            if folder not in own:
+                withdraw(folder)
 
 
 def _is_large(estimate: Plan) -> bool:
@@ -236,7 +258,6 @@ def _report(settings: RunSettings, inputs: Inputs, story: _Story, book: Book) ->
     done = Done(tuple(task for task in book.tasks if task.key in good))
     if not done.outputs("factors"):
         return
-    done.remove_other_tables()
     known = done.dataset()
     if known is not None:
         book.facts |= {"labelled": len(known), "lost_labels": known.losses}

@@ -5,6 +5,7 @@ import os
 import platform
 import resource
 import time
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -15,11 +16,15 @@ from typing import Any
 
 import numpy as np
 
+from tilestream.files import Files
+from tilestream.marks import sealed, unsealed
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.engine.stage import Task
 from tilestream.version import VERSION
 
+RECORD = "run.json"
+"""The file of the record."""
 WRITE_EVERY = 30.0
 """How often `run.json` is written while tasks end [s]."""
 
@@ -81,7 +86,8 @@ class Book:
             "failures": self.failures,
             **self.facts,
         }
-        write_text(self.folder / "run.json", json.dumps(content, indent=2, default=str) + "\n")
+        plain = json.loads(json.dumps(content, default=str))
+        write_text(self.folder / RECORD, json.dumps(sealed(plain), indent=2) + "\n")
         self.written = time.time()
         return content
 
@@ -115,19 +121,32 @@ class Book:
 
 
 def told_before(path: Path) -> dict[str, Any]:
-    """The record of earlier calls; empty where there is none, or none of this kind."""
+    """The record of earlier calls; empty where there is none, or it is not what was written."""
     try:
-        told = json.loads(path.read_text())
-    except (OSError, ValueError):
+        return unsealed(json.loads(path.read_text()))
+    except (OSError, ValueError, AttributeError):
         return {}
-    return told if isinstance(told, dict) and "calls" in told else {}
+
+
+def checksums(folder: Path) -> dict[str, str]:
+    """The checksums of what a run writes besides its tables, by path in the run directory."""
+    names = ["config.yaml", "model.skops", "tables/evaluation.json"]
+    names += sorted(
+        str(path.relative_to(folder)) for path in (folder / "report").rglob("*") if path.is_file()
+    )
+    return {
+        name: checksum_of(Files.at(folder / name)) for name in names if (folder / name).exists()
+    }
+
+
+def checksum_of(file: Files) -> str:
+    """The checksum of a file's bytes."""
+    return f"{zlib.crc32(file.read()):08x}"
 
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file: whole, or as it was."""
-    part = path.with_name(f"{path.name}.part")
-    part.write_text(text)
-    part.replace(path)
+    Files.at(path).write(text.encode())
 
 
 def machine() -> dict[str, Any]:

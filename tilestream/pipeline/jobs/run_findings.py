@@ -23,7 +23,7 @@ from tilestream.pipeline.stages.samples import places_with_factors
 from tilestream.records import Float64
 from tilestream.report.data import AROUND, Findings
 from tilestream.store import TileStore
-from tilestream.tables import read_tables, remove_others
+from tilestream.tables import read_tables
 
 PLACE = ["route_id", "sample"]
 _NO_POINTS = pd.DataFrame(
@@ -60,13 +60,6 @@ class Done:
             )
             for t in self.outputs("evaluate")
         }
-
-    def remove_other_tables(self) -> None:
-        """Remove the evaluations and estimates of other settings."""
-        for stages in (("evaluate", "importance"), ("predict",)):
-            paths = paths_of(task for stage in stages for task in self.outputs(stage))
-            if paths:
-                remove_others(paths)
 
 
 def places_of(done: Done) -> pd.DataFrame:

@@ -6,6 +6,7 @@ from pathlib import Path
 import pandas as pd
 
 from tilestream.errors import StoreNotFoundError
+from tilestream.pipeline.jobs.inventory import tables_in
 from tilestream.store import TileStore, open_store
 from tilestream.tables import read_mark, read_tables
 
@@ -45,5 +46,8 @@ def rows_of(place: str | os.PathLike[str], table: str) -> pd.DataFrame | None:
 
 def table_paths(place: str | os.PathLike[str], table: str) -> list[str]:
     """The files of a table of a run directory, sorted: of the main job, or of a command alone."""
-    folders = (Path(place) / "tables" / table, Path(place) / table)
-    return sorted(str(path) for folder in folders for path in folder.rglob("*.parquet"))
+    return [
+        path
+        for folder in (Path(place) / "tables" / table, Path(place) / table)
+        for path in tables_in(str(folder))
+    ]

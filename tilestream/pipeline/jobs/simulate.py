@@ -11,7 +11,8 @@ import numpy as np
 import yaml
 
 from tilestream.errors import PartialError, PlanError, UsageError
-from tilestream.formats.points.rows import writing_whole
+from tilestream.files import Files
+from tilestream.lock import only_writer
 from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.engine.stage import Task
@@ -78,6 +79,7 @@ def simulate(
         UsageError: an unknown path, a route through a building, or a directory that holds another
             simulation.
         PlanError: not enough space on the disk.
+        LockedError: another process writes to the directory.
         PartialError: some tasks failed; the message lists them, the rest is there.
     """
     folder = Path(out)
@@ -91,12 +93,16 @@ def simulate(
     city = SimulatedCity(settings.model_dump_json()).read()
     for street in city.streets:
         check_clear(street, city.footprints)
-    _begin(folder, city, identity)
-    outcomes = execute(plan, client, watch)
-    failures = {outcome.key: outcome.reason for outcome in outcomes if not outcome.ok}
+    with only_writer(folder):
+        _begin(folder, city, identity)
+        outcomes = execute(plan, client, watch)
+        failures = {outcome.key: outcome.reason for outcome in outcomes if not outcome.ok}
+        for name in ("", "survey", f"logs/drive{settings.drive}"):
+            Files.at(folder).under(name).remove_parts()
+        if not failures:
+            shutil.rmtree(folder / "parts", ignore_errors=True)
     if failures:
         raise PartialError(f"{folder}: {len(failures)} tasks failed, the rest is done:", failures)
-    shutil.rmtree(folder / "parts", ignore_errors=True)
     return folder
 
 
@@ -282,8 +288,7 @@ def _begin(folder: Path, city: City, identity: dict[str, Any]) -> None:
 def _keep(path: Path, text: str) -> None:
     """Write a file whole, unless it says so already: its time tells readers of a change."""
     if not path.exists() or path.read_bytes() != text.encode():
-        with writing_whole(path) as file:
-            file.write(text.encode())
+        Files.at(path).write(text.encode())
 
 
 def _feature(street: Street, city: City, end: int | None) -> dict[str, Any]:

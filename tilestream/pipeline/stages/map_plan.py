@@ -13,7 +13,7 @@ from tilestream.pipeline.stages.cells import cells
 from tilestream.pipeline.stages.map_part import MapPart
 from tilestream.pipeline.stages.surfels import surfels
 from tilestream.pipeline.stages.terms import terms
-from tilestream.store import POINTS, TileStore, TileTable, cells_table
+from tilestream.store import TileStore, TileTable, cells_table
 
 EXPECTED_DENSITY = 100
 """Points per square metre that a thinned tile is expected to keep, before it is merged: more than
@@ -48,10 +48,20 @@ class MapPlan:
         self._state = hash_of([(str(key), tile.identity) for key, tile in sorted(points.items())])
 
     @classmethod
-    def of_store(cls, store: TileStore) -> "MapPlan":
-        """A map that is there."""
-        marks = store.marks(POINTS)
-        done = {key: mark for key, mark in marks.items() if mark.status == "done"}
+    def of_store(cls, store: TileStore, *, partial: bool = False) -> "MapPlan":
+        """A map that is there.
+
+        Args:
+            store: where it is.
+            partial: also one that is half-made or has lost tiles; what could see those says so.
+
+        Raises:
+            IncompleteError: it is not whole, and not `partial`.
+        """
+        condition = store.condition()
+        if not partial:
+            condition.require_whole()
+        done = {key: mark for key, mark in condition.marks.items() if mark.status == "done"}
         return cls(
             store, {k: TilePoints(m.identity, "", m.facts["points"]) for k, m in done.items()}
         )

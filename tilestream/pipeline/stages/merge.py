@@ -5,17 +5,19 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from tilestream.errors import CorruptSourceError
+from tilestream.errors import DamagedError
 from tilestream.grid import MM_PER_M, TileGrid, TileKey, whole_mm
+from tilestream.kernels import scatter as kernels
 from tilestream.kernels import thinning
 from tilestream.marks import hash_of
 from tilestream.pipeline.engine.outputs import Made, TileArrays
 from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.engine.stage import BASE_BYTES, Counts, Task, stage
-from tilestream.pipeline.stages.scatter import Fragment, Int32, Print, add_prints, fragment_path
+from tilestream.pipeline.stages.scatter import Fragment, Int32, Print, add_prints, fragments_of
 from tilestream.records import Int64
-from tilestream.store import POINTS, TileStore, open_store
+from tilestream.store import POINTS, TileStore
 
 BATCH_POINTS = 500_000
 """Points that are read at a time."""
@@ -78,19 +80,29 @@ class Pieces:
         """The points, (n, 3) int32 [mm from the tile's origin], n <= `BATCH_POINTS`.
 
         Raises:
-            CorruptSourceError: a fragment is shorter than its index says (removed or cut
-                meanwhile).
+            DamagedError: a fragment is not what was written (removed, cut or changed meanwhile).
         """
-        store, point = open_store(self.store_url), 3 * np.dtype(np.int32).itemsize
+        folder, point = fragments_of(self.store_url), 3 * np.dtype(np.int32).itemsize
+        found = np.zeros(2, np.uint64)
         for piece in self.pieces:
-            path = f"{fragment_path(store, piece.fragment)}.bin"
+            file = folder.under(f"{piece.fragment}.bin")
             end = piece.start + piece.count
             for start in range(piece.start, end, BATCH_POINTS):
                 stop = min(start + BATCH_POINTS, end)
-                data = store.fs.cat_file(path, start=start * point, end=stop * point)
+                data = file.fs.cat_file(file.root, start=start * point, end=stop * point)
                 if len(data) != (stop - start) * point:
-                    raise CorruptSourceError(f"{path} was cut short: run the same command again")
-                yield np.frombuffer(data, np.int32).reshape(-1, 3)
+                    raise DamagedError(f"{file.root} was cut short: run the same command again")
+                points = np.frombuffer(data, np.int32).reshape(-1, 3)
+                kernels.add_print(points, found)
+                yield points
+        self._require_all(found)
+
+    def _require_all(self, found: NDArray[np.uint64]) -> None:
+        """Refuse points that are not those that were scattered."""
+        if (int(found[0]), int(found[1])) != self.fingerprint:
+            files = ", ".join(f"{name}.bin" for name in sorted({p.fragment for p in self.pieces}))
+            folder = fragments_of(self.store_url).root
+            raise DamagedError(f"{folder}: one of {files} is damaged: run the same command again")
 
 
 def memory_of(points: int, strips: int) -> int:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from tilestream.errors import PoseError, RegistrationError, UsageError
+from tilestream.errors import PoseError, RegistrationError, TileNotReadyError, UsageError
 from tilestream.grid import Box, TileKey
 from tilestream.kernels.fixed_order import norms
 from tilestream.label import FINE_CELL, refined_pose, start_errors, start_poses
@@ -107,7 +107,7 @@ def register(
             seen = scans.seen(scan)
             T_map_true = _true_pose(map_part, seen, measuring)
             found, points = _registered(map_part, seen, T_map_true, measuring, batch)
-        except (RegistrationError, PoseError, UsageError) as error:
+        except (RegistrationError, PoseError, UsageError, TileNotReadyError) as error:
             facts[str(sample.number)] = place | {"reason": str(error)}
         else:
             which = {"sample": sample.number, "scan": sample.scan, "stamp_ns": scan.stamp_ns}

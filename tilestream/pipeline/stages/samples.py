@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from tilestream.errors import SourceNotFoundError
+from tilestream.errors import DamagedError, SourceNotFoundError
 from tilestream.factors import catalogue, observability
 from tilestream.factors.rows import PLACE_COLUMNS
 from tilestream.factors.virtual_drive import averaged_along
@@ -16,7 +16,7 @@ from tilestream.marks import Mark
 from tilestream.model.dataset import Dataset
 from tilestream.model.features import features_of
 from tilestream.model.join import join
-from tilestream.pipeline.engine.outputs import Facts, Made, Stored
+from tilestream.pipeline.engine.outputs import Facts, Made, Parquet, Stored
 from tilestream.pipeline.engine.stage import stage
 from tilestream.pipeline.stages.label import ERROR_COLUMNS
 from tilestream.records import Column
@@ -50,10 +50,8 @@ LOST_COLUMNS = (
 
 
 @dataclass(frozen=True)
-class DatasetFile:
+class DatasetFile(Parquet):
     """Where the dataset goes; what is lost goes to `lost.parquet` beside it, first."""
-
-    path: str
 
     def known(self, identity: str) -> Facts | None:
         """As of any table."""
@@ -78,13 +76,20 @@ class DatasetFile:
         write_table(self.path, rows, kept, Mark("done", identity=identity, facts=facts))
         return {"rows": len(rows)}
 
+    def files(self, identity: str) -> dict[str, str]:
+        """Both files."""
+        return {self._lost: identity, self.path: identity}
+
     def read(self) -> Dataset:
         """The dataset; a process keeps the last one.
 
         Raises:
             SourceNotFoundError: there is none.
+            DamagedError: it is not what was written.
         """
         mark = read_mark(self.path)
+        if mark.status == "damaged":
+            raise DamagedError(mark.reason)
         if mark.status != "done":
             raise SourceNotFoundError(f"{self.path}: no dataset; the job that joins it has not run")
         return _dataset(self, mark.identity)

@@ -13,16 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tilestream.errors import CorruptSourceError
+from tilestream.files import Files
 from tilestream.formats import open_source
 from tilestream.formats.base import Block, SourceInfo, Span
 from tilestream.grid import MAX_XY_MM, MAX_Z_MM, MM_PER_M, TileGrid, TileKey
 from tilestream.kernels import scatter as kernels
-from tilestream.marks import hash_of
+from tilestream.marks import hash_of, sealed, unsealed
 from tilestream.pipeline.engine.outputs import Facts, Made
 from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.engine.stage import BASE_BYTES, Counts, Task, stage
 from tilestream.records import Int64
-from tilestream.store import TileStore, open_store
+from tilestream.store import TileStore
 
 Int32 = NDArray[np.int32]
 Print = tuple[int, int]
@@ -114,29 +115,33 @@ class FragmentFile:
 
     def known(self, identity: str) -> Facts | None:
         """The index, if the fragment is whole and of this identity."""
-        store = open_store(self.store_url)
         try:
-            known = json.loads(store.fs.cat_file(f"{fragment_path(store, self.name)}.json"))
-        except (FileNotFoundError, ValueError):
+            known = unsealed(json.loads(self._file("json").read()))
+        except (FileNotFoundError, ValueError, AttributeError):  # absent or damaged: made anew
             return None
         return dict(known["index"]) if known["identity"] == identity else None
 
     def write(self, made: Made, identity: str, columns: Sequence[Any]) -> Facts:  # noqa: ARG002
         """Write the groups as they come; the index last."""
-        store = open_store(self.store_url)
-        path = fragment_path(store, self.name)
-        store.fs.makedirs(f"{store.root}/fragments", exist_ok=True)
-        if store.fs.exists(f"{path}.json"):
-            store.fs.rm(f"{path}.json")  # an old index must not vouch for new points
-        with store.fs.open(f"{path}.bin", "wb") as file:
+        self._file("json").remove()  # an old index must not vouch for new points
+        with self._file("bin").writing() as file:
             index = asdict(_written(self.name, made.value, file))
-        with store.fs.open(f"{path}.json", "w") as file:
-            json.dump({"identity": identity, "index": index}, file)
+        self._file("json").write(
+            json.dumps(sealed({"identity": identity, "index": index})).encode()
+        )
         return index
 
     def read(self) -> Any:
         """Fragments are read piece by piece."""
         raise NotImplementedError
+
+    def _file(self, ending: str) -> Files:
+        return fragments_of(self.store_url).under(f"{self.name}.{ending}")
+
+
+def fragments_of(store_url: str) -> Files:
+    """Where an ingest keeps its fragments while it lasts."""
+    return Files.at(store_url).under("fragments")
 
 
 def _written(name: str, groups: Iterable[Grouped], file: Any) -> Fragment:
@@ -152,11 +157,6 @@ def _written(name: str, groups: Iterable[Grouped], file: Any) -> Fragment:
             start += count
     of_tiles = tuple((*key, *fingerprint) for key, fingerprint in prints.items())
     return Fragment(name, start, dropped, tuple(pieces), of_tiles)
-
-
-def fragment_path(store: TileStore, name: str) -> str:
-    """Where a fragment's points lie, without the ending."""
-    return f"{store.root}/fragments/{name}"
 
 
 def _memory(counts: Counts) -> int:

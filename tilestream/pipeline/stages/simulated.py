@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from tilestream.files import Files
 from tilestream.formats.logs import write_log
 from tilestream.formats.points.las import write_las
-from tilestream.formats.points.rows import writing_whole
 from tilestream.marks import hash_of
 from tilestream.pipeline.engine.outputs import Facts, Made
 from tilestream.pipeline.engine.stage import Counts, stage
@@ -97,7 +97,7 @@ class ScanParts(_WholeFile):
             arrays[f"points_{count}"] = scan.points.astype(np.float32)
             arrays[f"stamp_{count}"] = np.int64(scan.stamp_ns)
             count += 1
-        with writing_whole(self.path) as file:
+        with Files.at(self.path).writing() as file:
             np.savez(file, allow_pickle=False, count=np.int64(count), **arrays)
         return {"scans": count}
 
@@ -116,9 +116,7 @@ class DriveLog(_WholeFile):
     def write(self, made: Made, identity: str, columns: Sequence[Column]) -> Facts:  # noqa: ARG002
         """Write scans, odometry and truth."""
         scans, believed, truth = made.value
-        part = Path(self.path).with_suffix(".part")
-        write_log(part, scans, believed, truth=truth)
-        part.replace(self.path)
+        write_log(self.path, scans, believed, truth=truth)
         return made.facts
 
     def read(self) -> Any:

@@ -1,0 +1,174 @@
+"""Files at a path or URL: whole or not there, on the disk before they have their name.
+
+A path is taken as it is: nothing in it is a pattern, and what is removed is named, never searched.
+"""
+
+import os
+import re
+import shutil
+import uuid
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO, Self
+
+import fsspec
+from fsspec.implementations.local import LocalFileSystem
+
+PART = re.compile(r"^\..*\.[0-9a-f]{32}\.part$")
+"""The name of a file while it is being written."""
+
+
+@dataclass(frozen=True)
+class Files:
+    """Where files lie: a folder or a file on a disk or in an object store."""
+
+    fs: Any
+    """The fsspec filesystem."""
+    root: str
+    """Its path there; of a local one the absolute path."""
+
+    @classmethod
+    def at(cls, url: str | os.PathLike[str]) -> Self:
+        """The place that a local path or an fsspec URL names."""
+        text = os.fspath(url)
+        if "://" not in text:
+            return cls(LocalFileSystem(), os.path.abspath(text))  # noqa: PTH100 - also of what is not there
+        fs, root = fsspec.core.url_to_fs(text)
+        fs.use_listings_cache = False
+        return cls(fs, str(root).rstrip("/"))
+
+    @property
+    def local(self) -> bool:
+        """Whether it is on a disk of this machine."""
+        return isinstance(self.fs, LocalFileSystem)
+
+    def under(self, name: str) -> Self:
+        """A place below: `name` may have several parts; empty: this place itself."""
+        return type(self)(self.fs, f"{self.root}/{name}") if name else self
+
+    @property
+    def name(self) -> str:
+        """Its last part."""
+        return self.root.rsplit("/", 1)[-1]
+
+    @property
+    def parent(self) -> Self:
+        """The folder that it lies in."""
+        return type(self)(self.fs, self.root.rsplit("/", 1)[0])
+
+    def read(self) -> bytes:
+        """The bytes of this file.
+
+        Raises:
+            FileNotFoundError: it is not there.
+            OSError: it cannot be read.
+        """
+        return bytes(self.fs.cat_file(self.root))
+
+    def read_all(self, names: Sequence[str]) -> list[bytes | None]:
+        """The bytes of files below, in one request where that is possible; None: not there.
+
+        Raises:
+            OSError: one is there, or may be, and cannot be read: absent is not unreadable.
+        """
+        if not names:
+            return []
+        paths = [f"{self.root}/{name}" for name in names]
+        found = self.fs.cat_ranges(paths, None, None, on_error="return")
+        for content in found:
+            if isinstance(content, Exception) and not isinstance(content, FileNotFoundError):
+                raise content
+        return [None if isinstance(content, Exception) else bytes(content) for content in found]
+
+    def write(self, content: bytes) -> None:
+        """Write this file: whole and on the disk, or as it was."""
+        if self.local:
+            with self.writing() as file:
+                file.write(content)
+        else:  # an object appears with its last byte
+            self.fs.pipe_file(self.root, content)
+
+    @contextmanager
+    def writing(self) -> Iterator[BinaryIO]:
+        """This file, to be written bit by bit: it has its name once it is whole and on the disk.
+
+        In an object store, where an upload can be broken off half-way, it is read by nobody before
+        something else vouches for it.
+        """
+        if not self.local:
+            with self.fs.open(self.root, "wb") as file:
+                yield file
+            return
+        target = Path(self.root)
+        self.parent.make()
+        part = target.with_name(f".{target.name}.{uuid.uuid4().hex}.part")
+        try:
+            with part.open("wb") as file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            part.replace(target)
+        except BaseException:
+            part.unlink(missing_ok=True)
+            raise
+        _sync(target.parent)
+
+    def make(self) -> None:
+        """Make this folder, with those above it.
+
+        Raises:
+            FileExistsError, NotADirectoryError: a file is in the way.
+        """
+        if not self.local:
+            self.fs.makedirs(self.root, exist_ok=True)
+            return
+        folder = Path(self.root)
+        missing = [way for way in (folder, *folder.parents) if not way.exists()]
+        folder.mkdir(parents=True, exist_ok=True)
+        for made in missing:
+            _sync(made.parent)
+
+    def there(self) -> bool:
+        """Whether this file or folder is there."""
+        return bool(self.fs.exists(self.root))
+
+    def names(self) -> list[str]:
+        """The names of what lies in this folder, sorted; none where it is not there."""
+        try:
+            entries = self.fs.ls(self.root, detail=False)
+        except FileNotFoundError:
+            return []
+        paths = {str(entry).rstrip("/") for entry in entries} - {self.root}
+        return sorted(path.rsplit("/", 1)[-1] for path in paths)
+
+    def remove(self) -> None:
+        """Remove this file, or this folder with all in it, if it is there."""
+        if self.local:
+            way = Path(self.root)
+            if way.is_dir() and not way.is_symlink():
+                shutil.rmtree(way)
+            else:
+                way.unlink(missing_ok=True)
+            return
+        for path in [*self.fs.find(self.root), self.root]:
+            try:
+                self.fs.rm_file(path)
+            except FileNotFoundError:
+                continue
+
+    def remove_parts(self) -> None:
+        """Remove the half-written files that killed writers have left in this folder."""
+        for name in self.names():
+            if PART.search(name):
+                self.under(name).remove()
+
+
+def _sync(folder: Path) -> None:
+    """Put the names in a folder on the disk."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
