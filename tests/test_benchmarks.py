@@ -28,6 +28,7 @@ SMALLEST = (
     "figures.py --spacing 1.0 --figures figures",
     "figures_simulation.py --figures figures",
     "ingest.py --points 0.01 --repeats 1",
+    "power_loss.py --points 300",
     "predict.py --rows 10 --share 0.05",
     "raycast.py --metres 1 --rounds 1",
     "registration.py --starts 1",
@@ -36,6 +37,7 @@ SMALLEST = (
     "shinjuku_labels.py --size small --paths III --every 40 --out labels --knobs drive",
     "shinjuku_routes.py routes.geojson",
     "simulate.py --metres 1",
+    "trust.py --blocks 1 --rounds 1",
     "virtual_drive.py cost --tiles 1 --spacing 0.5",
     "walk.py",
 )
