@@ -595,7 +595,7 @@ LEARNING = "out: run\nmap: {sources: [a.pcd]}\nroutes: [r.csv]\nsimulate: {}\n"
         (LEARNING + "sensor: {name: x}", r"sensor.*: range_max is .*Field required"),
         (LEARNING + "drives: {log: a.mcap}", r"drives is .*valid tuple"),
         ("just words", r"give the fields of a job"),
-        ("out: [", r"no YAML"),
+        ("out: [", r"no readable YAML"),
     ],
 )
 def test_settings_that_cannot_be_are_named(tmp_path: Path, text: str, said: str) -> None:

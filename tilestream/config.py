@@ -6,6 +6,7 @@ explain` and the help of the command line print it.
 
 import difflib
 import re
+import reprlib
 from collections.abc import Iterator
 from typing import Any
 
@@ -49,4 +50,4 @@ def _readable(error: ValidationError, known: list[str]) -> Iterator[str]:
             said = problem["msg"].removeprefix("Value error, ")
             yield NESTED.sub(": ", f"{key} {said}").strip()
         else:
-            yield f"{key} is {problem['input']!r}: {problem['msg']}"
+            yield f"{key} is {reprlib.repr(problem['input'])}: {problem['msg']}"

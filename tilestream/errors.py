@@ -4,6 +4,9 @@ A message says what is wrong, where, and what to do about it. Each class is also
 exception that a caller would expect, so `except FileNotFoundError` works as usual.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class TilestreamError(Exception):
     """Base of all errors raised on purpose."""
@@ -96,3 +99,30 @@ class PartialError(TaskError):
         lines = "".join(f"\n  {name}: {reason}" for name, reason in sorted(failures.items()))
         super().__init__(what + lines)
         self.failures = failures
+
+
+COPY_AGAIN = "copy it again from where it came from"
+"""What to do about a damaged file."""
+
+
+@contextmanager
+def foreign_errors(
+    kind: type[TilestreamError], what: str, advice: str = COPY_AGAIN
+) -> Iterator[None]:
+    """The gate where a file is read: what a library raises on damaged bytes becomes one of ours.
+
+    Our own errors pass, and so does what the machine failed (`OSError`, `MemoryError`). The message
+    holds type and text of the original, which stays its cause: a bug of ours is seen as one.
+
+    Args:
+        kind: what it becomes.
+        what: which file, and what is wrong with it where this happens.
+        advice: what to do about it.
+    """
+    try:
+        yield
+    except (TilestreamError, OSError, MemoryError):
+        raise
+    except Exception as error:
+        said = " ".join(str(error).split())[:300]
+        raise kind(f"{what} ({type(error).__name__}: {said}); {advice}") from error

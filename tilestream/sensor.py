@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Annotated, Any, Self
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
+from tilestream.bounded_yaml import read_yaml
 from tilestream.config import Settings
 from tilestream.errors import UsageError
 from tilestream.kernels.fixed_order import turned
@@ -272,8 +272,13 @@ def sensor_of(given: Any) -> Carrier:
     """
     if isinstance(given, Sensor | Vehicle):
         return given
+    if isinstance(given, str) and given in SENSORS:
+        return SENSORS[given]
     if isinstance(given, str):
-        return SENSORS[given] if given in SENSORS else sensor_of(_read(given))
+        try:
+            return sensor_of(_read(given))
+        except RecursionError:
+            raise UsageError(f"{given}: names itself among its sensors") from None
     if isinstance(given, Mapping) and given.keys() == {"sensors"}:
         given = given["sensors"]
     if isinstance(given, list | tuple):
@@ -293,10 +298,7 @@ def _read(path: str) -> Any:
     """The fields of a sensor, or a list of sensors, in a YAML file."""
     if not Path(path).is_file():
         raise UsageError(f"{path}: no such sensor or file; known are {', '.join(SENSORS)}")
-    try:
-        fields = yaml.safe_load(Path(path).read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: no YAML: {error}") from None
+    fields = read_yaml(Path(path), UsageError)
     if not isinstance(fields, dict | list):
         raise UsageError(f"{path}: give the fields of a sensor, e.g. range_max: 100.0")
     return fields

@@ -5,10 +5,10 @@ import re
 from pathlib import Path
 from typing import Any
 
-import yaml
 from pyproj import Transformer
 
-from tilestream.errors import CorruptSourceError, SourceNotFoundError
+from tilestream.bounded_yaml import read_yaml
+from tilestream.errors import CorruptSourceError
 
 PROJECTOR = "map_projector_info.yaml"
 METADATA = "pointcloud_map_metadata.yaml"
@@ -21,20 +21,14 @@ _K0 = 0.9996
 """Scale of UTM at its central meridian; Autoware's default for its own transverse Mercator."""
 
 
-def read_yaml(path: Path) -> dict[Any, Any]:
+def read_mapping(path: Path) -> dict[Any, Any]:
     """The mapping that a YAML file holds.
 
     Raises:
         SourceNotFoundError: there is no such file.
         CorruptSourceError: it is no YAML, or no mapping.
     """
-    try:
-        content = yaml.load(path.read_text("utf-8"), yaml.CSafeLoader)
-    except FileNotFoundError as error:
-        raise SourceNotFoundError(f"{path}: no such file") from error
-    except (yaml.YAMLError, UnicodeDecodeError, ValueError, RecursionError) as error:
-        why = " ".join(str(error).split())
-        raise CorruptSourceError(f"{path}: is no readable YAML: {why}") from error
+    content = read_yaml(path, CorruptSourceError)
     if not isinstance(content, dict):
         raise CorruptSourceError(f"{path}: holds {type(content).__name__}, not `name: value` lines")
     return content
@@ -64,7 +58,7 @@ def read_projector(path: Path) -> tuple[str | None, tuple[str, ...]]:
     Raises:
         CorruptSourceError: no YAML, no projector_type, or a grid or origin that cannot be.
     """
-    content = read_yaml(path)
+    content = read_mapping(path)
     kind = content.get("projector_type")
     if not isinstance(kind, str):
         raise CorruptSourceError(f"{path}: has no projector_type")

@@ -1,14 +1,15 @@
 """Settings of a simulated city and its drives; presets are YAML files that users can copy."""
 
 import zlib
+from contextlib import nullcontext
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import yaml
 from pydantic import BeforeValidator, Field
 
+from tilestream.bounded_yaml import read_yaml
 from tilestream.config import Settings
 from tilestream.errors import SourceNotFoundError, UsageError
 from tilestream.sensor import SENSORS, Sensor, Vehicle, named
@@ -156,12 +157,11 @@ def load_preset(name: str) -> SimulationSettings:
         UsageError: an unknown key or a value that cannot be; names the file.
     """
     shipped = resources.files("tilestream") / "simulation" / "presets" / f"{name}.yaml"
-    path = Path(name)
-    if not shipped.is_file() and not path.is_file():
+    if not shipped.is_file() and not Path(name).is_file():
         raise SourceNotFoundError(f"{name}: no preset and no file; presets are paper and physical")
-    text = shipped.read_text() if shipped.is_file() else path.read_text()
+    with resources.as_file(shipped) if shipped.is_file() else nullcontext(Path(name)) as path:
+        values = read_yaml(path, UsageError) or {}
     try:
-        values = yaml.safe_load(text) or {}
         return SimulationSettings(**values)
-    except (yaml.YAMLError, TypeError, UsageError) as error:
+    except (TypeError, UsageError) as error:
         raise UsageError(f"{name}: {error}") from None

@@ -12,7 +12,7 @@ from tilestream.errors import CorruptSourceError, SourceNotFoundError
 from tilestream.formats.base import Block, SourceInfo, Span
 from tilestream.formats.points.pcd import open_pcd
 from tilestream.formats.points.rows import RowSource, whole_span
-from tilestream.formats.projector import METADATA, PROJECTOR, read_projector, read_yaml
+from tilestream.formats.projector import METADATA, PROJECTOR, read_mapping, read_projector
 from tilestream.formats.registry import Format
 
 _INSIDE = "pointcloud_map.pcd"
@@ -82,7 +82,7 @@ def open_map_directory(path: str) -> MapDirectory:
     """
     folder = Path(path)
     metadata = folder / METADATA
-    content = read_yaml(metadata)
+    content = read_mapping(metadata)
     width, height = (
         _length(content.pop(name, None), name, metadata)
         for name in ("x_resolution", "y_resolution")

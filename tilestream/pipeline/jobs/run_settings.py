@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Self
 
-import yaml
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 
+from tilestream.bounded_yaml import parse_yaml, read_yaml
 from tilestream.config import Settings
-from tilestream.errors import SourceNotFoundError, UsageError
+from tilestream.errors import SourceNotFoundError, UsageError, foreign_errors
 from tilestream.model.registry import COMPETITORS, DEFAULT, RECIPES, UNTRAINED
 from tilestream.settings import (
     DriveSettings,
@@ -124,10 +124,7 @@ def read_settings(path: str | os.PathLike[str], changes: Sequence[str] = ()) -> 
     place = Path(path)
     if not place.is_file():
         raise SourceNotFoundError(f"{place}: no such config; `tilestream template` prints one")
-    try:
-        values = yaml.safe_load(place.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise UsageError(f"{place}: no YAML: {error}") from None
+    values = read_yaml(place, UsageError)
     if not isinstance(values, dict):
         raise UsageError(f"{place}: give the fields of a job, e.g. out: run")
     for change in changes:
@@ -151,4 +148,5 @@ def _apply(values: dict[str, object], change: str) -> None:
         if not isinstance(below, dict):
             raise UsageError(f"{change!r}: {level} holds a value, nothing lies below it")
         at = below
-    at[last] = yaml.safe_load(text)
+    with foreign_errors(UsageError, f"{change!r}: no YAML", "give a plain value"):
+        at[last] = parse_yaml(text)

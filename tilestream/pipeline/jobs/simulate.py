@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import yaml
 
+from tilestream.bounded_yaml import read_yaml
 from tilestream.errors import PartialError, PlanError, UsageError
 from tilestream.files import Files
 from tilestream.lock import only_writer
@@ -255,11 +256,10 @@ def _require_same(folder: Path, identity: dict[str, Any]) -> None:
     record = folder / RECORD
     if not record.exists():
         return
-    try:
-        known = yaml.safe_load(record.read_text())
-        there = {name: known.get(name) for name in identity}
-    except (yaml.YAMLError, AttributeError):
-        raise UsageError(f"{record} is no record of a simulation: give another directory") from None
+    known = read_yaml(record, UsageError)
+    if not isinstance(known, dict):
+        raise UsageError(f"{record} is no record of a simulation: give another directory")
+    there = {name: known.get(name) for name in identity}
     other = [f"{name} {there[name]}" for name in identity if there[name] != identity[name]]
     if other:
         raise UsageError(
