@@ -1,11 +1,12 @@
 """A model is one file: a skops archive of exactly these types, with all that it depends on inside.
 
 Reading one runs nothing from it: types are compared with a list before anything is built, and each
-regressor checks what it is built from (`Regressor.load`).
+regressor checks what it is built from (`Regressor.load`). It unpacks to no more than a model would.
 """
 
 import io
 import json
+import math
 import os
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -18,7 +19,7 @@ import sklearn
 import skops
 import skops.io
 
-from tilestream.errors import ModelError, SourceNotFoundError
+from tilestream.errors import ModelError, SourceNotFoundError, foreign_errors
 from tilestream.files import Files
 from tilestream.model.domain import Domain
 from tilestream.model.explain import Typical
@@ -44,6 +45,14 @@ TYPES = CONTAINERS.union(*(regressor.types for regressor in REGRESSORS.values())
 """Every type that a model file may name."""
 TYPICAL = ("middle", "below", "above", "rho")
 """The arrays of `Typical`, one number per factor."""
+SCHEMA = "schema.json"
+"""What skops calls its list of types; every other member is an array."""
+SCHEMA_MAX = 1 << 26
+"""Longest schema that is read [bytes]: one of 2,000 trees takes 12 MB."""
+NODES_MAX = 500_000
+"""Most lists and mappings in it: one of 2,000 trees has 42,000."""
+RATIO_MAX = 20
+"""A model unpacks to at most so many times its file, a schema on top: forests take 4 to 6 times."""
 
 
 def save_model(model: Model, path: str | os.PathLike[str]) -> None:
@@ -96,34 +105,57 @@ def load_model(path: str | os.PathLike[str]) -> Model:
     place = Path(path)
     if not place.is_file():
         raise SourceNotFoundError(f"{place}: no such model file")
-    data = place.read_bytes()
-    _refuse_other_types(place, data)
-    try:
-        content = skops.io.loads(data, trusted=sorted(TYPES))
-        facts = json.loads(content["facts"])
-        _refuse_other_versions(place, facts)
-        return _model(content, facts)
-    except ModelError:
-        raise
-    # A damaged archive fails anywhere inside skops and NumPy; all that it can mean is this.
-    except Exception as error:
-        raise ModelError(
-            f"{place}: a damaged model file ({type(error).__name__}: {error}): train it again"
-        ) from error
-
-
-def _refuse_other_types(place: Path, data: bytes) -> None:
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            schema = json.loads(archive.read("schema.json"))
-    except (zipfile.BadZipFile, KeyError, ValueError) as error:
-        raise ModelError(f"{place}: no model file of tilestream ({error})") from None
-    others = sorted(set(_types(schema)) - TYPES)
+    with foreign_errors(ModelError, f"{place}: no model file of tilestream", "train it again"):
+        data, schema = _unpacked(place.read_bytes())
+        others = sorted(set(_types(schema)) - TYPES)
     if others:
         raise ModelError(
             f"{place}: refused, since it names types that no model of tilestream has: "
             f"{', '.join(others)}"
         )
+    with foreign_errors(ModelError, f"{place}: a damaged model file", "train it again"):
+        content = skops.io.loads(data, trusted=sorted(TYPES))
+        facts = json.loads(content["facts"])
+        _refuse_other_versions(place, facts)
+        return _model(content, facts)
+
+
+def _unpacked(data: bytes) -> tuple[bytes, Any]:
+    """The same archive without compression, and its schema: `zipfile`, as skops calls it, unpacks
+    all that a member holds, whatever size it claims.
+    """
+    plain = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(data)) as archive, zipfile.ZipFile(plain, "w") as target:
+        members = {info.filename: info for info in archive.infolist()}
+        if len(members) < len(archive.infolist()):
+            raise ValueError("a member is there twice")
+        for info in members.values():
+            if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise ValueError(f"{info.filename} is compressed by another method than deflate")
+        claimed = sum(info.file_size for info in members.values())
+        if members[SCHEMA].file_size > SCHEMA_MAX or claimed > SCHEMA_MAX + RATIO_MAX * len(data):
+            raise ValueError(f"claims to unpack to {claimed} bytes, more than a model would")
+        for name, info in members.items():
+            with archive.open(info) as member:
+                content = member.read(info.file_size)
+            if name == SCHEMA:
+                schema = content
+            else:
+                _check_array(name, content)
+            target.writestr(name, content)
+    if schema.count(b"{") + schema.count(b"[") > NODES_MAX:
+        raise ValueError(f"its schema has more than {NODES_MAX} parts")
+    return plain.getvalue(), json.loads(schema)
+
+
+def _check_array(name: str, content: bytes) -> None:
+    """Refuse an array that claims to be larger than its member, or smaller."""
+    file = io.BytesIO(content)
+    if np.lib.format.read_magic(file) != (1, 0):
+        raise ValueError(f"{name} is no array of NumPy's format 1.0")
+    shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+    if math.prod(shape) * dtype.itemsize != len(content) - file.tell():
+        raise ValueError(f"{name} claims to be an array of shape {shape} of {dtype}, and is not")
 
 
 def _types(node: Any) -> Iterator[str]:
