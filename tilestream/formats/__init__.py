@@ -62,7 +62,7 @@ def open_source(path: str | os.PathLike[str], **options: object) -> PointSource:
     known = {option for f in FORMATS for option in f.options}
     if unknown := sorted(options.keys() - known):
         raise UsageError(f"{name}: no format takes the option {', '.join(unknown)}")
-    return found.open(name, **{o: options[o] for o in found.options if o in options})
+    return found.opened(name, **{o: options[o] for o in found.options if o in options})
 
 
 def describe(path: str | os.PathLike[str], **options: object) -> SourceInfo:

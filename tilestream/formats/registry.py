@@ -6,7 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, TypeVar
 
-from tilestream.errors import CorruptSourceError, SourceNotFoundError, UnknownFormatError
+from tilestream.errors import (
+    CorruptSourceError,
+    SourceNotFoundError,
+    UnknownFormatError,
+    foreign_errors,
+)
 
 Opened_co = TypeVar("Opened_co", covariant=True)
 
@@ -40,6 +45,16 @@ class Format(Generic[Opened_co]):
         if self.recognise is not None:
             return self.recognise(head)
         return bool(self.magic) and head.startswith(self.magic)
+
+    def opened(self, path: str, *arguments: object, **options: object) -> Opened_co:
+        """What `open` makes of a file, and `CorruptSourceError` of all that a library raises."""
+        try:
+            with foreign_errors(CorruptSourceError, f"{path}: cannot be read as {self.name}"):
+                return self.open(path, *arguments, **options)
+        except MemoryError as error:
+            raise CorruptSourceError(
+                f"{path}: claims more than fits into memory ({error}): it is damaged, or too large"
+            ) from error
 
     def __str__(self) -> str:
         where = ", ".join(self.endings) or f"a directory with {self.marker}"

@@ -79,4 +79,4 @@ def _opened(
     state: tuple[int, int],  # noqa: ARG001  a changed log is another
     options: LogOptions,
 ) -> ScanLog:
-    return with_poses(found.open(path, options), options.max_gap_s)
+    return with_poses(found.opened(path, options), options.max_gap_s)

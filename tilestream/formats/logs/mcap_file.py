@@ -15,21 +15,21 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.reader import make_reader
-from mcap.records import Channel, Chunk, Schema
-from mcap.stream_reader import CRCValidationError, get_chunk_data_stream
+from mcap.records import Channel, ChunkIndex, Schema, Statistics
 from mcap.summary import Summary
 
-from tilestream.errors import CorruptSourceError
+from tilestream.errors import CorruptSourceError, foreign_errors
+from tilestream.formats.logs.mcap_chunk import LARGEST_RECORD, unpack_chunk
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = struct.Struct("<BQ")
 MESSAGE_HEAD = struct.Struct("<HIQQ")
 FOOTER = struct.Struct("<BQQQI")
-LARGEST_CHUNK = 4 * 2**30
-"""Bytes that a chunk may claim to unpack to; more is taken for damage."""
+_PIECE = 1 << 20
+"""What is read at once of a record that only counts for the CRC [bytes]."""
+_READ = (Opcode.CHUNK, Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.DATA_END)
+"""Records that are read; all others are passed over."""
 
 
 @dataclass(frozen=True)
@@ -139,16 +139,37 @@ class McapFile(AbstractContextManager["McapFile"]):
             raise self._corrupt(at, "should be the footer and is not")
         if start == 0:
             return None
-        if crc and zlib.crc32(self._read(start, at + FOOTER.size - 4 - start)) != crc:
+        if at - start > LARGEST_RECORD:
+            raise self._corrupt(start, f"(the summary) claims {at - start} bytes")
+        content = self._read(start, at + FOOTER.size - 4 - start)
+        if crc and zlib.crc32(content) != crc:
             raise self._corrupt(start, "(the summary) fails its CRC")
-        try:
-            self._stream.seek(0)
-            summary = make_reader(self._stream).get_summary()
-        except (McapError, struct.error, ValueError) as error:
-            raise self._corrupt(start, f"(the summary) cannot be read ({error})") from error
-        if summary is None or summary.statistics is None or not summary.chunk_indexes:
+        return self._useful(self._summary_of(start, content[: at - start]))
+
+    def _summary_of(self, start: int, content: bytes) -> Summary:
+        summary = Summary()
+        for opcode, begin, end in self._inner_records(start, content):
+            stream = ReadDataStream(io.BytesIO(content[begin:end]))
+            with self._errors(start, "(the summary) cannot be read"):
+                if opcode == Opcode.SCHEMA:
+                    schema = Schema.read(stream)
+                    summary.schemas[schema.id] = schema
+                elif opcode == Opcode.CHANNEL:
+                    channel = Channel.read(stream)
+                    summary.channels[channel.id] = channel
+                elif opcode == Opcode.STATISTICS:
+                    summary.statistics = Statistics.read(stream)
+                elif opcode == Opcode.CHUNK_INDEX:
+                    summary.chunk_indexes.append(ChunkIndex.read(stream))
+        return summary
+
+    @staticmethod
+    def _useful(summary: Summary) -> Summary | None:
+        """The summary if it leads to every chunk, each once; else None."""
+        if summary.statistics is None or not summary.chunk_indexes:
             return None
-        if summary.statistics.chunk_count != len(summary.chunk_indexes):
+        chunks = {index.chunk_start_offset for index in summary.chunk_indexes}
+        if not summary.statistics.chunk_count == len(summary.chunk_indexes) == len(chunks):
             return None
         counted = summary.statistics.channel_message_counts
         if not all(channel in summary.channels for channel in counted):
@@ -193,6 +214,12 @@ class McapFile(AbstractContextManager["McapFile"]):
         at, crc = len(MAGIC), zlib.crc32(MAGIC)
         try:
             while True:
+                opcode, size = self._head(at)
+                if opcode not in _READ:
+                    for piece in range(at, at + size, _PIECE):
+                        crc = zlib.crc32(self._read(piece, min(_PIECE, at + size - piece)), crc)
+                    at += size
+                    continue
                 opcode, content = self._record(at)
                 if opcode == Opcode.DATA_END:
                     self._check_data_crc(at, content, crc)
@@ -202,7 +229,7 @@ class McapFile(AbstractContextManager["McapFile"]):
                     yield at, self._unpacked(at, opcode, content)
                 else:
                     self._learn(opcode, content[RECORD_HEAD.size :])
-                at += len(content)
+                at += size
         except CorruptSourceError:
             if self.whole:
                 raise
@@ -215,16 +242,23 @@ class McapFile(AbstractContextManager["McapFile"]):
             raise self._corrupt(at, f"(end of data) gives CRC {recorded:#x}, the data {crc:#x}")
         self.unchecked &= recorded == 0
 
-    def _record(self, at: int) -> tuple[int, bytes]:
-        """Opcode and bytes, head included, of the record at an offset."""
+    def _head(self, at: int) -> tuple[int, int]:
+        """Opcode and size, head included, of the record at an offset; it ends within the file."""
         head = self._read(at, RECORD_HEAD.size)
         if len(head) < RECORD_HEAD.size:
             raise self._corrupt(at, "is cut short")
         opcode, length = RECORD_HEAD.unpack(head)
         if opcode == 0 or at + RECORD_HEAD.size + length > self.size:
             raise self._corrupt(at, f"(opcode {opcode}) claims {length} bytes, more than there are")
-        content = head + self._read(at + RECORD_HEAD.size, length)
-        if len(content) < RECORD_HEAD.size + length:
+        return opcode, RECORD_HEAD.size + length
+
+    def _record(self, at: int) -> tuple[int, bytes]:
+        """Opcode and bytes, head included, of the record at an offset."""
+        opcode, size = self._head(at)
+        if size > LARGEST_RECORD:
+            raise self._corrupt(at, f"claims {size} bytes, more than {LARGEST_RECORD}")
+        content = self._read(at, size)
+        if len(content) < size:
             raise self._corrupt(at, "is cut short")
         return opcode, content
 
@@ -234,23 +268,11 @@ class McapFile(AbstractContextManager["McapFile"]):
             return content
         if opcode != Opcode.CHUNK:
             raise self._corrupt(at, f"should be a chunk and is of opcode {opcode}")
-        try:
-            chunk = Chunk.read(ReadDataStream(io.BytesIO(content[RECORD_HEAD.size :])))
-            if chunk.uncompressed_size > LARGEST_CHUNK:
-                raise self._corrupt(at, f"claims to unpack to {chunk.uncompressed_size} bytes")
-            self.unchecked |= chunk.uncompressed_crc == 0
-            stream, length = get_chunk_data_stream(chunk, validate_crc=True)
-            data = stream.read(length)
-        except CRCValidationError as error:
-            raise self._corrupt(
-                at, f"fails its CRC (recorded {error.expected:#x}, found {error.actual:#x})"
-            ) from error
-        except CorruptSourceError:
-            raise
-        except Exception as error:  # each compression library raises its own
-            raise self._corrupt(at, f"does not unpack, so its CRC cannot hold ({error})") from error
-        if len(data) != chunk.uncompressed_size:
-            raise self._corrupt(at, f"unpacks to {len(data)} bytes, not {chunk.uncompressed_size}")
+        with self._errors(at, "does not unpack, so its CRC cannot hold"):
+            data, recorded, crc = unpack_chunk(memoryview(content)[RECORD_HEAD.size :])
+        if recorded not in (0, crc):
+            raise self._corrupt(at, f"fails its CRC (recorded {recorded:#x}, found {crc:#x})")
+        self.unchecked |= recorded == 0
         return data
 
     def _inner_records(self, record: int, content: bytes) -> Iterator[tuple[int, int, int]]:
@@ -261,22 +283,19 @@ class McapFile(AbstractContextManager["McapFile"]):
                 raise self._corrupt(record, "ends inside a record")
             opcode, length = RECORD_HEAD.unpack_from(content, at)
             start, at = at + RECORD_HEAD.size, at + RECORD_HEAD.size + length
-            if at > len(content):
+            if opcode == 0 or at > len(content):
                 raise self._corrupt(record, "ends inside a record")
             yield opcode, start, at
 
     def _learn(self, opcode: int, content: bytes) -> None:
         stream = ReadDataStream(io.BytesIO(content))
-        try:
+        what = f"{self.path}: a schema or channel cannot be read"
+        with foreign_errors(CorruptSourceError, what, "copy the file anew"):
             if opcode == Opcode.SCHEMA:
                 schema = Schema.read(stream)
                 self._schemas[schema.id] = schema.name
             elif opcode == Opcode.CHANNEL:
                 self._learn_channel(Channel.read(stream))
-        except (McapError, struct.error, ValueError) as error:
-            raise CorruptSourceError(
-                f"{self.path}: a schema or channel cannot be read ({error}); copy the file anew"
-            ) from error
 
     def _learn_channel(self, channel: Channel) -> None:
         named = self._schemas.get(channel.schema_id, "").replace("/msg/", "/")
@@ -285,6 +304,11 @@ class McapFile(AbstractContextManager["McapFile"]):
     def _read(self, at: int, length: int) -> bytes:
         self._stream.seek(at)
         return self._stream.read(length)
+
+    def _errors(self, at: int, what: str) -> AbstractContextManager[None]:
+        """Whatever the libraries raise on damaged bytes of the record at an offset."""
+        what = f"{self.path}: record at byte {at} {what}"
+        return foreign_errors(CorruptSourceError, what, "copy the file anew")
 
     def _corrupt(self, at: int, what: str) -> CorruptSourceError:
         return CorruptSourceError(f"{self.path}: record at byte {at} {what}; copy the file anew")

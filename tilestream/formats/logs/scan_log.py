@@ -6,7 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tilestream.errors import CorruptSourceError, PoseError, SourceNotFoundError
+from tilestream.errors import (
+    CorruptSourceError,
+    PoseError,
+    SourceNotFoundError,
+    foreign_errors,
+)
 from tilestream.formats.base import SourceInfo
 from tilestream.formats.logs.base import RecordedScan, Recording
 from tilestream.formats.logs.drivers import returned, time_offsets
@@ -59,10 +64,13 @@ class ScanLog(Recording):
         """Some scans as they were recorded, posed or not; errors as for `scans`."""
         changed = f"{self.path}: has changed since it was opened; open it again"
         try:
-            for index, recorded in zip(indices, self.reader.read(indices), strict=True):
-                if recorded.stamp_ns != self.stamps_ns[index]:
-                    raise CorruptSourceError(changed)
-                yield recorded
+            with foreign_errors(
+                CorruptSourceError, f"{self.path}: cannot be read as {self.format}"
+            ):
+                for index, recorded in zip(indices, self.reader.read(indices), strict=True):
+                    if recorded.stamp_ns != self.stamps_ns[index]:
+                        raise CorruptSourceError(changed)
+                    yield recorded
         except FileNotFoundError as error:
             raise SourceNotFoundError(f"{changed} ({error})") from error
 

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from tilestream.errors import CorruptSourceError, UsageError
+from tilestream.errors import CorruptSourceError, UsageError, foreign_errors
 from tilestream.formats.base import Block, SourceInfo, Span
 from tilestream.kernels.rows import finite_points
 from tilestream.records import Float64
@@ -101,7 +101,9 @@ class RowSource:
 
     def blocks(self, span: Span, block_points: int) -> Iterator[Block]:
         """The points of a span in blocks; see `PointSource.blocks`."""
-        return self.rows.blocks(span, block_points)
+        what = f"{self.path}: cannot be read as {self.summary.format}"
+        with foreign_errors(CorruptSourceError, what):
+            yield from self.rows.blocks(span, block_points)
 
 
 def even_spans(count: int, points: int) -> list[Span]:

@@ -10,6 +10,7 @@ from tilestream.errors import (
     SourceError,
     SourceNotFoundError,
     UnknownFormatError,
+    foreign_errors,
 )
 from tilestream.formats.logs import LOG_FORMATS, is_log, open_log
 from tilestream.formats.routes.arc_length import resample, route_of
@@ -86,23 +87,24 @@ def read_routes(
         CrsError: degrees without `project_to`, or a CRS that cannot be used.
     """
     name = str(path)
-    paths = _paths(name, pose_topic, points_topic)
-    if not paths:
-        raise CorruptSourceError(f"{name}: holds no route")
-    crs = crs or paths[0].crs
-    drawn = READERS.get(Path(name).suffix.lower(), read_poses) is not read_poses
-    points = metric(name, [p.positions for p in paths], crs, project_to, drawn)
-    lift = z_offset or (np.nan if is_log(name) and z_offset is None else 0.0)
-    return [
-        route_of(
-            p.route_id,
-            xyz + np.array([0.0, 0.0, lift]),
-            crs=project_to or crs,
-            max_jump=max_jump,
-            where=f"{name}: route {p.route_id}",
-        )
-        for p, xyz in zip(paths, points, strict=True)
-    ]
+    with foreign_errors(CorruptSourceError, f"{name}: cannot be read as routes"):
+        paths = _paths(name, pose_topic, points_topic)
+        if not paths:
+            raise CorruptSourceError(f"{name}: holds no route")
+        crs = crs or paths[0].crs
+        drawn = READERS.get(Path(name).suffix.lower(), read_poses) is not read_poses
+        points = metric(name, [p.positions for p in paths], crs, project_to, drawn)
+        lift = z_offset or (np.nan if is_log(name) and z_offset is None else 0.0)
+        return [
+            route_of(
+                p.route_id,
+                xyz + np.array([0.0, 0.0, lift]),
+                crs=project_to or crs,
+                max_jump=max_jump,
+                where=f"{name}: route {p.route_id}",
+            )
+            for p, xyz in zip(paths, points, strict=True)
+        ]
 
 
 def read_route(
