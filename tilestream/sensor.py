@@ -279,11 +279,14 @@ def sensor_of(given: Any) -> Carrier:
             return sensor_of(_read(given))
         except RecursionError:
             raise UsageError(f"{given}: names itself among its sensors") from None
+        except UsageError as error:
+            told = str(error)
+            raise UsageError(told if told.startswith(given) else f"{given}: {told}") from None
     if isinstance(given, Mapping) and given.keys() == {"sensors"}:
         given = given["sensors"]
     if isinstance(given, list | tuple):
         return Vehicle(sensors=tuple(part for one in given for part in sensor_of(one).sensors))
-    if not isinstance(given, Mapping):
+    if not isinstance(given, Mapping) or not all(isinstance(key, str) for key in given):
         raise UsageError(f"sensor is {given!r}: give a name, a file, fields, or a list of these")
     known = SENSORS.get(str(given.get("name")))
     return Sensor(**(known.model_dump() if known else {}) | dict(given))

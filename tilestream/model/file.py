@@ -51,6 +51,8 @@ SCHEMA_MAX = 1 << 26
 """Longest schema that is read [bytes]: one of 2,000 trees takes 12 MB."""
 NODES_MAX = 500_000
 """Most lists and mappings in it: one of 2,000 trees has 42,000."""
+HEADER_MAX = 600
+"""Longest description of an array [bytes]: one of a tree's nodes takes 310."""
 RATIO_MAX = 20
 """A model unpacks to at most so many times its file, a schema on top: forests take 4 to 6 times."""
 
@@ -153,7 +155,7 @@ def _check_array(name: str, content: bytes) -> None:
     file = io.BytesIO(content)
     if np.lib.format.read_magic(file) != (1, 0):
         raise ValueError(f"{name} is no array of NumPy's format 1.0")
-    shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+    shape, _, dtype = np.lib.format.read_array_header_1_0(file, max_header_size=HEADER_MAX)
     if math.prod(shape) * dtype.itemsize != len(content) - file.tell():
         raise ValueError(f"{name} claims to be an array of shape {shape} of {dtype}, and is not")
 

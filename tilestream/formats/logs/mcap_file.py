@@ -302,7 +302,7 @@ class McapFile(AbstractContextManager["McapFile"]):
         self._channels[channel.id] = (channel.topic, named, channel.message_encoding)
 
     def _read(self, at: int, length: int) -> bytes:
-        self._stream.seek(at)
+        self._stream.seek(min(at, self.size))
         return self._stream.read(length)
 
     def _errors(self, at: int, what: str) -> AbstractContextManager[None]:

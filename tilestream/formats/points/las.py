@@ -54,6 +54,13 @@ _ONLY_XYZ = lazrs.DecompressionSelection(
     lazrs.SELECTIVE_DECOMPRESS_XY_RETURNS_CHANNEL | lazrs.SELECTIVE_DECOMPRESS_Z
 )
 """What is decoded of a LAZ point where its format can be decoded in parts (6 to 10)."""
+_LARGEST_CHUNK = 1 << 28
+"""What a chunk may claim to unpack to [bytes]: 7 million points, and writers choose 50,000."""
+_LAYERED = 3
+"""How such points are packed: each chunk in layers, after its first point, its count and the size
+of each layer."""
+_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
+"""Layers of an item of such a point, by its type; bytes that a user added (14) have one each."""
 
 
 @dataclass(frozen=True)
@@ -111,6 +118,7 @@ class LazRows:
         count = chunk.span.stop - chunk.span.start
         points = np.zeros(count, self.dtype)
         with _laspy_errors(self.path, f"points {chunk.span.start} to {chunk.span.stop - 1}"):
+            _check_layers(packed, self.packing, self.dtype.itemsize)
             lazrs.decompress_points_with_chunk_table(
                 packed, self.packing, points.view(np.uint8), [(count, len(packed))], _ONLY_XYZ
             )
@@ -205,7 +213,7 @@ def _checked_header(file: BinaryIO, size_bytes: int, path: str) -> tuple[int, in
             "cut short or damaged"
         )
     for _ in range(evlrs):
-        file.seek(evlrs_at)
+        file.seek(min(evlrs_at, size_bytes))
         evlr = file.read(_EVLR.size)
         evlrs_at += _EVLR.size + (_EVLR.unpack(evlr)[2] if len(evlr) == _EVLR.size else 0)
         if evlrs_at > size_bytes:
@@ -265,10 +273,26 @@ def _chunks(
     chunks, start, offset = [], 0, rows.offset + 8
     for count, packed_bytes in table:
         span = Span(start, min(start + count, rows.count))
+        if (span.stop - span.start) * rows.size > _LARGEST_CHUNK:
+            raise CorruptSourceError(
+                f"{rows.path}: claims {span.stop - span.start} points in a chunk of {packed_bytes} "
+                f"bytes at offset {offset}, more than {_LARGEST_CHUNK} bytes of them: it is damaged"
+            )
         if span.start < span.stop:
             chunks.append(_Chunk(span, offset, packed_bytes))
         start, offset = span.stop, offset + packed_bytes
     return tuple(chunks)
+
+
+def _check_layers(packed: bytes, packing: bytes, point_bytes: int) -> None:
+    """Refuse a chunk whose layers claim more than it has: lazrs would end the process."""
+    compressor, items = struct.unpack_from("<H30xH", packing)
+    if compressor == _LAYERED:
+        kinds = struct.iter_unpack("<HH2x", packing[34 : 34 + 6 * items])
+        layers = sum(_LAYERS.get(kind, size) for kind, size in kinds)
+        sizes = np.frombuffer(packed, "<u4", layers, point_bytes + 4)
+        if sizes.sum(dtype=np.uint64) > len(packed):
+            raise ValueError(f"its layers claim {sizes.tolist()} of {len(packed)} bytes")
 
 
 def _crs(header: laspy.LasHeader, path: str) -> tuple[str | None, tuple[str, ...]]:

@@ -14,6 +14,8 @@ TANGENT_M = 0.5
 """The heading at a point is the direction of the chord from this far before to this far after."""
 STEEPEST = 0.5
 """Climb per horizontal length of a whole route that no road has."""
+SLOPE_POINTS = 1_000_000
+"""At most so many points of a route are looked at for that, a metre apart up to 1,000 km."""
 
 
 def route_of(
@@ -103,8 +105,9 @@ def _distinct(points: Float64) -> list[int]:
 
 
 def _check_slope(where: str, positions: Float64, arc_length: Float64) -> None:
-    # on points a metre apart, since the noise of dense poses climbs too
-    coarse = _at(positions, arc_length, np.append(np.arange(0.0, arc_length[-1]), arc_length[-1]))
+    # on points about a metre apart, since the noise of dense poses climbs too
+    count = min(math.ceil(arc_length[-1]), SLOPE_POINTS)
+    coarse = _at(positions, arc_length, np.linspace(0.0, arc_length[-1], count + 1))
     steps = np.diff(coarse, axis=0)
     climb, run = np.abs(steps[:, 2]).sum(), np.hypot(steps[:, 0], steps[:, 1]).sum()
     if climb > STEEPEST * run:

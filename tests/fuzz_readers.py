@@ -1,0 +1,214 @@
+"""Every reader that is fuzzed, a line each: how a small file is made, and how it is read whole."""
+
+import functools
+import hashlib
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import fuzz_bombs as bombs
+import logs
+import numpy as np
+from fuzz_mutations import Mutate, in_chunks, in_json, in_pages, in_zip, mutated
+from mcap.writer import CompressionType
+from model_data import dataset, drives
+from points import far_points, write_e57, write_map_directory, write_ply
+from test_lanelet2 import osm
+from test_las import laz_of_chunks
+from test_routes import as_csv, as_kitti, as_tum, geojson, line
+
+from tilestream.formats import open_source
+from tilestream.formats.logs import open_log
+from tilestream.formats.points.las import write_las
+from tilestream.formats.points.pcd import write_pcd
+from tilestream.formats.projector import METADATA, PROJECTOR
+from tilestream.formats.routes import read_routes
+from tilestream.model.file import load_model, save_model
+from tilestream.model.forest import Growth, PaperForest
+from tilestream.model.training import predict, train
+from tilestream.pipeline.jobs.run_settings import read_settings
+from tilestream.sensor import sensor_of
+from tilestream.simulation.settings import load_preset
+
+PLACES = drives(2, {"d": 20})[0]
+JOB = """out: run
+map: {sources: [a.pcd], tile_size: 50.0}
+drives:
+  - {log: a.mcap, name: monday, every: 2}
+routes: [r.csv]
+sensor: {name: VLP16, range_max: 60.0}
+label: {matcher: {solver: raw}, starts: {radius: 1.0}}
+observe: {range_max: 40.0}
+memory: 2GB
+"""
+SENSOR = "- {name: VLP16, range_max: 50.0, mount: {x: 1.0, yaw_deg: 90}}\n- {name: HDL64}\n"
+PRESET = "preset: mine\nlidar:\n  range_max: 75.0\nsurvey:\n  noise: 0.03\n  traffic: 1.0\n"
+MAP = (
+    "projector_type: TransverseMercator\nscale_factor: 0.9996\n"
+    "map_origin: {latitude: 35.6, longitude: 139.7}\n"
+)
+
+
+@dataclass(frozen=True)
+class Reader:
+    """Something that reads a kind of file."""
+
+    name: str
+    """What the table calls it."""
+    file: str
+    """The file that is damaged, in a folder of its own."""
+    make: Callable[[Path], object]
+    """Writes a small one, whole."""
+    read: Callable[[Path], Iterator[object]]
+    """Everything that is in one, as something that has the same `repr` or bytes if it is equal."""
+    mutate: Mutate = mutated
+    """How it is damaged."""
+    bombs: Callable[[bytes], Iterator[bytes]] = lambda _: iter(())
+    """Files that are worse than any chance."""
+
+    def digest(self, path: Path) -> str:
+        """What is in a file, in a few letters."""
+        found = hashlib.sha256()
+        for part in self.read(path):
+            found.update(part.tobytes() if isinstance(part, np.ndarray) else repr(part).encode())
+        return found.hexdigest()[:16]
+
+
+def points(path: Path) -> Iterator[object]:
+    """A source of points, whose promises are kept."""
+    source = open_source(path)
+    info, count = source.info(), 0
+    yield info.crs, info.fields
+    for span in source.spans(150):
+        for block in source.blocks(span, 64):
+            assert np.isfinite(block.points).all(), "points that are not finite"
+            assert len(block.points) + block.dropped <= 64, "a block that is too long"
+            count += len(block.points) + block.dropped
+            yield block.points
+    assert count == info.points, f"{count} of {info.points} points"
+
+
+def log(path: Path) -> Iterator[object]:
+    """A log as scans, and as points of a map."""
+    opened = open_log(path)
+    yield opened.info().fields, opened.frame
+    for scan in opened.scans():
+        assert np.isfinite(scan.points).all(), "points that are not finite"
+        yield scan.stamp_ns
+        yield from (scan.points, scan.T_map_lidar, scan.intensity, scan.time_offset)
+    source = open_source(path)
+    for span in source.spans(150):
+        for block in source.blocks(span, 64):
+            assert np.isfinite(block.points).all(), "points that are not finite"
+
+
+def routes(path: Path) -> Iterator[object]:
+    for route in read_routes(path):
+        yield route.route_id, route.crs
+        yield route.positions
+        yield route.heading
+
+
+def map_directory(path: Path) -> Iterator[object]:
+    return points(path.parent)
+
+
+def job(path: Path) -> Iterator[object]:
+    yield read_settings(path).model_dump_json()
+
+
+def sensor(path: Path) -> Iterator[object]:
+    yield sensor_of(str(path))
+
+
+def preset(path: Path) -> Iterator[object]:
+    yield load_preset(str(path))
+
+
+def model(path: Path) -> Iterator[object]:
+    """A model, and what it estimates."""
+    found = load_model(path)
+    yield json.dumps(found.facts, sort_keys=True), found.worst
+    yield predict(found, PLACES).to_dict("list")
+
+
+def write_model(path: Path) -> None:
+    with patch.object(PaperForest, "defaults", asdict(Growth(trees=3))):
+        save_model(train(dataset(1, 0.9, {"a": 120, "b": 120}), recipe="paper"), path)
+
+
+def text(content: str) -> Callable[[Path], object]:
+    return lambda path: path.write_text(content)
+
+
+def write_map(path: Path) -> None:
+    write_map_directory(path.parent, far_points(60))
+    (path.parent / PROJECTOR).write_text(MAP)
+
+
+def street(**options: Any) -> Callable[[Path], object]:
+    """A log of four scans, written with these options of `mcap`."""
+
+    def make(path: Path) -> None:
+        whole = logs.street_log(path.with_name("whole.mcap"), scans=4, chunk_size=1500)
+        logs.rewrite(whole, path, **{"chunk_size": 1500, **options})
+        whole.unlink()
+
+    return make
+
+
+def of_points(name: str, file: str, write: Callable[..., object], **more: Any) -> Reader:
+    return Reader(name, file, lambda path: write(path, far_points(200)), points, **more)
+
+
+def of_routes(name: str, file: str, make: Callable[[Path], object], **more: Any) -> Reader:
+    return Reader(name, file, make, routes, **more)
+
+
+ascii_ = functools.partial(write_pcd, encoding="ascii")
+compressed = functools.partial(write_pcd, encoding="binary_compressed")
+ply_text = functools.partial(write_ply, text=True)
+ply_big = functools.partial(write_ply, byte_order=">")
+las = functools.partial(write_las, crs="EPSG:6677")
+LANES = {1: ([0, 1], [100, 101]), 2: ([1, 2], [101, 102])}
+NO_CRC = {"enable_crcs": False, "enable_data_crcs": False}
+
+READERS = (
+    of_points("PCD ascii", "a.pcd", ascii_, bombs=bombs.of_pcd),
+    of_points("PCD binary", "a.pcd", write_pcd, bombs=bombs.of_pcd),
+    of_points("PCD compressed", "a.pcd", compressed, bombs=bombs.of_pcd),
+    of_points("LAS", "a.las", las),
+    of_points("LAZ", "a.laz", las, bombs=bombs.of_laz),
+    Reader(
+        "LAZ as COPC",
+        "a.laz",
+        lambda path: path.write_bytes(laz_of_chunks([10, 100, 101, 200])[0]),
+        points,
+        bombs=bombs.of_laz,
+    ),
+    of_points("PLY ascii", "a.ply", ply_text),
+    of_points("PLY binary", "a.ply", write_ply),
+    of_points("PLY big-endian", "a.ply", ply_big),
+    of_points("E57", "a.e57", write_e57, mutate=in_pages, bombs=bombs.of_e57),
+    Reader("Autoware metadata", METADATA, write_map, map_directory, bombs=bombs.of_yaml),
+    Reader("Autoware projector", PROJECTOR, write_map, map_directory, bombs=bombs.of_yaml),
+    Reader("MCAP zstd", "a.mcap", street(), log, in_chunks, bombs.of_mcap),
+    Reader(
+        "MCAP lz4", "a.mcap", street(compression=CompressionType.LZ4), log, in_chunks, bombs.of_mcap
+    ),
+    Reader("MCAP plain", "a.mcap", street(compression=CompressionType.NONE, **NO_CRC), log),
+    Reader("MCAP no chunks", "a.mcap", street(use_chunking=False, **NO_CRC), log),
+    of_routes("GeoJSON", "a.geojson", lambda p: geojson(p, line([[0, 0], [9, 1], [20, 0]])),
+              mutate=in_json, bombs=bombs.of_json),
+    of_routes("CSV", "a.csv", as_csv, bombs=bombs.of_rows),
+    of_routes("TUM", "a.tum", as_tum, bombs=bombs.of_rows),
+    of_routes("KITTI", "a.kitti", as_kitti, bombs=bombs.of_rows),
+    of_routes("Lanelet2", "a.osm", lambda path: osm(path, LANES), bombs=bombs.of_osm),
+    Reader("job", "job.yaml", text(JOB), job, bombs=bombs.of_yaml),
+    Reader("sensor", "sensor.yaml", text(SENSOR), sensor, bombs=bombs.of_yaml),
+    Reader("preset", "preset.yaml", text(PRESET), preset, bombs=bombs.of_yaml),
+    Reader("model", "a.skops", write_model, model, in_zip, bombs.of_model),
+)  # fmt: skip
