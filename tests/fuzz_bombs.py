@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import struct
 import zipfile
 import zlib
@@ -195,7 +196,13 @@ def of_e57(data: bytes) -> Iterator[bytes]:
         head + b"<e57Root" + tail.replace(b"</guid>", b"x" * 30_000_000 + b"</guid>", 1),
         head + b"<a>" * 100_000,
     ]
-    for record in (b"recordCount=", b"recordCount =", b"fileOffset="):
+    number = re.compile(rb"<(cartesian.) type=\"Float\"[^>]*?(/>|>.*?</cartesian.>)")
+    constant = number.sub(rb'<\1 type="Integer" minimum="5" maximum="5">5</\1>', xml)
+    others += [
+        re.sub(rb'recordCount="\d+"', b'recordCount="%s"' % count, constant)
+        for count in (b"10000", b"4000000000000")
+    ]
+    for record in (b"recordCount=", b"fileOffset="):
         for count in (b"4000000000000", b"-1", b"99999999999999999999", b"0"):
             at = xml.find(record)
             if at >= 0:

@@ -1,4 +1,4 @@
-"""Damaged files of every kind: an error of ours that names the file, or data, soon and in bounds."""
+"""Damaged files of every kind: an error of ours that names the file, or data, in bounds."""
 
 import sys
 

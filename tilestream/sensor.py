@@ -279,7 +279,7 @@ def sensor_of(given: Any) -> Carrier:
             return sensor_of(_read(given))
         except RecursionError:
             raise UsageError(f"{given}: names itself among its sensors") from None
-        except UsageError as error:
+        except (UsageError, TypeError) as error:  # TypeError: a key that is no text
             told = str(error)
             raise UsageError(told if told.startswith(given) else f"{given}: {told}") from None
     if isinstance(given, Mapping) and given.keys() == {"sensors"}:

@@ -88,6 +88,7 @@ class McapFile(AbstractContextManager["McapFile"]):
             self.unchecked = False
             self._channels: dict[int, tuple[str, str, str]] = {}
             self._schemas: dict[int, str] = {}
+            self._learnt: dict[tuple[int, bytes], bytes] = {}
             self._summary = self._read_summary() if self.whole and topics else None
             self.topics = self._count_topics() if topics else ()
         except BaseException:
@@ -288,13 +289,19 @@ class McapFile(AbstractContextManager["McapFile"]):
             yield opcode, start, at
 
     def _learn(self, opcode: int, content: bytes) -> None:
+        key = (opcode, content[:2])  # its number
+        if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL) or self._learnt.get(key) == content:
+            return
+        if opcode == Opcode.SCHEMA:
+            self._learnt.clear()  # it may be the one of a channel that came before
+        self._learnt[key] = content
         stream = ReadDataStream(io.BytesIO(content))
         what = f"{self.path}: a schema or channel cannot be read"
         with foreign_errors(CorruptSourceError, what, "copy the file anew"):
             if opcode == Opcode.SCHEMA:
                 schema = Schema.read(stream)
                 self._schemas[schema.id] = schema.name
-            elif opcode == Opcode.CHANNEL:
+            else:
                 self._learn_channel(Channel.read(stream))
 
     def _learn_channel(self, channel: Channel) -> None:
