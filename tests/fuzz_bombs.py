@@ -155,11 +155,10 @@ def of_model(data: bytes) -> Iterator[bytes]:
 
 
 def with_content(schema: bytes, name: bytes, value: int) -> bytes:
-    """The schema with another number in the first member of this name."""
-    head, _, tail = schema.partition(b'"%s"' % name)
-    before, _, rest = tail.partition(b'"content": "')
-    _, _, after = rest.partition(b'"')
-    return b'%s"%s"%s"content": "%d"%s' % (head, name, before, value, after)
+    """The schema with another number in every member of this name."""
+    kind = b'"__class__": "str", "__module__": "builtins", "__loader__": "JsonNode"'
+    node = b'"%s": {%s, "content": "%d", "is_json": true}' % (name, kind, value)
+    return re.sub(rb'"%s": \{[^{}]*\}' % name, node, schema)
 
 
 def one_member_more(data: bytes, name: str, deflated: bytes, claim: int, crc: int) -> bytes:
@@ -184,36 +183,45 @@ def one_member_more(data: bytes, name: str, deflated: bytes, claim: int, crc: in
 
 def of_e57(data: bytes) -> Iterator[bytes]:
     """Other XML in the same place: entities of entities, points without bits."""
-    content = b"".join(data[at : at + 1020] for at in range(0, len(data), 1024))
-    physical, length = struct.unpack_from("<QQ", content, 24)
-    begin = physical // 1024 * 1020 + physical % 1024
-    xml = content[begin : begin + length]
+    xml = xml_of(data)
     entities = "".join(f'<!ENTITY a{i} "{f"&a{i - 1};" * 10}">' for i in range(1, 11)).encode()
     doctype = b'<!DOCTYPE e57Root [<!ENTITY a0 "lol">' + entities + b"]>"
     head, _, tail = xml.partition(b"<e57Root")
-    others = [
-        head + doctype + b"<e57Root" + tail.replace(b"</e57Root>", b"&a10;</e57Root>"),
-        head + b"<e57Root" + tail.replace(b"</guid>", b"x" * 30_000_000 + b"</guid>", 1),
-        head + b"<a>" * 100_000,
-    ]
+    yield with_xml(
+        data, head + doctype + b"<e57Root" + tail.replace(b"</e57Root>", b"&a10;</e57Root>")
+    )
+    yield with_xml(
+        data, head + b"<e57Root" + tail.replace(b"</guid>", b"x" * 30_000_000 + b"</guid>", 1)
+    )
+    yield with_xml(data, head + b"<a>" * 100_000)
+    for count in (10_000, 4 * 10**12):
+        yield of_constant_points(data, count)
+    for member in (b"recordCount", b"fileOffset"):
+        for count in (4 * 10**12, -1, 10**20, 0):
+            yield with_xml(data, re.sub(rb'%s="\d+"' % member, b'%s="%d"' % (member, count), xml))
+
+
+def of_constant_points(data: bytes, count: int) -> bytes:
+    """An E57 file that claims so many points, each of which takes no bits."""
     number = re.compile(rb"<(cartesian.) type=\"Float\"[^>]*?(/>|>.*?</cartesian.>)")
-    constant = number.sub(rb'<\1 type="Integer" minimum="5" maximum="5">5</\1>', xml)
-    others += [
-        re.sub(rb'recordCount="\d+"', b'recordCount="%s"' % count, constant)
-        for count in (b"10000", b"4000000000000")
-    ]
-    for record in (b"recordCount=", b"fileOffset="):
-        for count in (b"4000000000000", b"-1", b"99999999999999999999", b"0"):
-            at = xml.find(record)
-            if at >= 0:
-                end = xml.index(b'"', at + len(record) + 1)
-                others.append(xml[:at] + record + b'"' + count + xml[end:])
-    for other in others:
-        logical = bytearray(content[:begin] + other)
-        struct.pack_into("<QQQ", logical, 16, 0, physical, len(other))
-        size = -(-len(logical) // 1020) * 1024
-        struct.pack_into("<Q", logical, 16, size)
-        yield paged(bytes(logical))
+    xml = number.sub(rb'<\1 type="Integer" minimum="5" maximum="5">5</\1>', xml_of(data))
+    return with_xml(data, re.sub(rb'recordCount="\d+"', b'recordCount="%d"' % count, xml))
+
+
+def xml_of(data: bytes) -> bytes:
+    """What describes the scans of an E57 file, at its end."""
+    content = b"".join(data[at : at + 1020] for at in range(0, len(data), 1024))
+    physical, length = struct.unpack_from("<QQ", content, 24)
+    return content[physical // 1024 * 1020 + physical % 1024 :][:length]
+
+
+def with_xml(data: bytes, xml: bytes) -> bytes:
+    """The E57 file with another description."""
+    content = b"".join(data[at : at + 1020] for at in range(0, len(data), 1024))
+    (physical,) = struct.unpack_from("<Q", content, 24)
+    logical = bytearray(content[: physical // 1024 * 1020 + physical % 1024] + xml)
+    struct.pack_into("<QQQ", logical, 16, -(-len(logical) // 1020) * 1024, physical, len(xml))
+    return paged(bytes(logical))
 
 
 def of_laz(data: bytes) -> Iterator[bytes]:

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fuzz_bombs import of_constant_points
 from points import blocks_of, points_of
 from scipy.spatial.transform import Rotation
 
@@ -123,6 +124,15 @@ def test_scans_that_cannot_be_placed_are_refused(tmp_path: Path) -> None:
     write_raw(tmp_path / "b.e57", columns, None)
     with pytest.raises(CorruptSourceError, match="neither cartesian nor spherical"):
         open_source(tmp_path / "b.e57")
+
+
+def test_points_that_take_no_bits_are_counted_within_reason(tmp_path: Path) -> None:
+    path = tmp_path / "a.e57"
+    with pye57.E57(str(path), "w") as file:
+        file.write_scan_raw(scan_of(local_points()))
+    path.write_bytes(of_constant_points(path.read_bytes(), 4 * 10**12))
+    with pytest.raises(CorruptSourceError, match=r"a\.e57: .*points of at least 0 bits"):
+        open_source(path)
 
 
 def test_a_flipped_byte_is_found_by_its_checksum(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from tilestream.errors import (
     UsageError,
 )
 from tilestream.formats import FORMATS, describe, expand_sources, open_source
+from tilestream.formats.points import pcd, rows
 from tilestream.formats.points.las import write_las
 from tilestream.formats.points.pcd import write_pcd
 
@@ -240,6 +241,34 @@ def test_a_header_that_claims_too_much_is_refused_before_allocating(
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 5_000_000
+
+
+@pytest.mark.parametrize("error", [KeyError("x"), OverflowError("too large"), RecursionError()])
+def test_what_a_library_raises_is_named_with_its_file_and_cause(
+    error: Exception, files: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> None:
+        raise error
+
+    source = open_source(files["pcd binary"])
+    monkeypatch.setattr(rows, "finite_block", fails)
+    with pytest.raises(CorruptSourceError, match=rf"b\.pcd: .*{type(error).__name__}") as caught:
+        list(source.blocks(source.spans(N)[0], N))
+    assert caught.value.__cause__ is error
+    monkeypatch.setattr(pcd, "crs_beside", fails)
+    with pytest.raises(CorruptSourceError, match=rf"b\.pcd: .*{type(error).__name__}"):
+        open_source(files["pcd binary"])
+
+
+def test_what_does_not_fit_into_memory_when_it_is_opened_is_named(
+    files: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(pcd, "crs_beside", fails)
+    with pytest.raises(CorruptSourceError, match=r"b\.pcd: claims more than fits into memory"):
+        open_source(files["pcd binary"])
 
 
 @pytest.mark.parametrize("name", IN_ONE_FILE)

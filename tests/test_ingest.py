@@ -12,9 +12,12 @@ from pathlib import Path
 import distributed
 import numpy as np
 import pytest
+import zstandard
+from fuzz_mutations import mcap_of
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from killed import killed_after
+from mcap.records import Chunk
 
 import tilestream as ts
 from tilestream.errors import (
@@ -318,6 +321,18 @@ def test_the_good_sources_are_ingested_and_the_bad_one_leaves_nothing(tmp_path: 
     both = ts.ingest([good, bad], url, tile_size=10.0)
     fresh = ts.ingest([good, bad], tmp_path / "fresh.zarr", tile_size=10.0)
     assert tree_digest(both.url) == tree_digest(fresh.url)
+
+
+def test_a_bomb_is_named_and_the_good_source_is_ingested(tmp_path: Path) -> None:
+    good, bomb = tmp_path / "good.pcd", tmp_path / "bomb.mcap"
+    write_pcd(good, np.random.default_rng(5).uniform(0.0, 20.0, (1000, 3)))
+    packed = zstandard.compress(bytes(10**7))
+    bomb.write_bytes(mcap_of([Chunk("zstd", packed, 0, 0, 0, 1000)]))
+    with pytest.raises(PartialError) as caught:
+        ts.ingest([good, bomb], tmp_path / "map.zarr", tile_size=10.0)
+    assert list(caught.value.failures) == [str(bomb)]
+    alone = ts.ingest(good, tmp_path / "alone.zarr", tile_size=10.0)
+    assert ts.open_store(str(tmp_path / "map.zarr")).marks() == alone.marks()
 
 
 def test_sources_that_all_fail_leave_the_map_as_it_was(tmp_path: Path) -> None:

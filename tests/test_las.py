@@ -9,6 +9,7 @@ import lazrs
 import numpy as np
 import pyproj
 import pytest
+from fuzz_bombs import of_laz
 from points import points_of
 
 from tilestream.errors import CorruptSourceError, CrsError
@@ -151,6 +152,20 @@ def test_spans_are_whole_chunks(tmp_path: Path) -> None:
         (50_000, 100_000),
         (100_000, 120_000),
     ]
+
+
+def test_a_chunk_that_claims_more_than_it_has_is_refused(tmp_path: Path) -> None:
+    content, _ = laz_of_chunks([10, 100])
+    header = laspy.LasHeader.read_from(io.BytesIO(content))
+    layers_at = header.offset_to_point_data + 8 + header.point_format.size + 4
+    path = tmp_path / "a.laz"
+    path.write_bytes(content[:layers_at] + struct.pack("<I", 2**31) + content[layers_at + 4 :])
+    with pytest.raises(CorruptSourceError, match=r"a\.laz: .*its layers claim \[2147483648, "):
+        points_of(path)
+    for forged in of_laz(content):
+        path.write_bytes(forged)
+        with pytest.raises(CorruptSourceError, match=r"a\.laz: "):
+            points_of(path)
 
 
 def test_claims_of_the_header_are_checked(tmp_path: Path) -> None:

@@ -1,16 +1,22 @@
 """Logs that are damaged, cut short, or lack what is needed: an error that says where, or a loss
 that is reported; never a plausible result."""
 
+import struct
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
 import logs
+import lz4.frame
 import numpy as np
 import pytest
+import zstandard
+from fuzz_mutations import mcap_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from logs import START, pose
 from mcap.reader import make_reader
+from mcap.records import Chunk
 from mcap.writer import CompressionType, IndexType
 
 from tilestream.errors import (
@@ -306,4 +312,43 @@ def test_a_ros_1_log_is_refused(street: Path, tmp_path: Path) -> None:
         writer.add_message(channel, START, b"12345678", START)
         writer.finish()
     with pytest.raises(SourceError, match=r"'ros1'.*convert"):
+        open_log(path)
+
+
+@pytest.mark.parametrize("kind", ["zstd", "zstd of no size", "lz4"])
+def test_a_chunk_is_never_unpacked_beyond_its_claim(kind: str, tmp_path: Path) -> None:
+    zeros, path = bytes(10**7), tmp_path / "a.mcap"
+    if kind == "lz4":
+        data = lz4.frame.compress(zeros)
+    else:
+        named = zstandard.ZstdCompressor(write_content_size=kind == "zstd")
+        data = named.compress(zeros)
+    del zeros
+    chunk = Chunk(kind.split(maxsplit=1)[0], data, 0, 0, 0, 1000)
+    path.write_bytes(mcap_of([chunk]))
+    tracemalloc.start()
+    try:
+        with pytest.raises(
+            CorruptSourceError, match=r"a\.mcap: record at byte \d+ does not unpack"
+        ):
+            open_log(path)
+        assert tracemalloc.get_traced_memory()[1] < 5_000_000
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_chunk_that_claims_more_than_any_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    data = zstandard.compress(bytes(1000))
+    path.write_bytes(mcap_of([Chunk("zstd", data, 0, 0, 0, 2**40)]))
+    with pytest.raises(CorruptSourceError, match=rf"claims to unpack to {2**40} bytes"):
+        open_log(path)
+
+
+def test_a_summary_that_leads_through_the_chunks_unpacks_none(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    whole = mcap_of([Chunk("zstd", zstandard.compress(bytes(10**7)), 0, 0, 0, 1000)])
+    footer = len(whole) - 8 - 20
+    path.write_bytes(whole[:footer] + struct.pack("<QQI", 8, 0, 0) + whole[-8:])
+    with pytest.raises(CorruptSourceError, match=r"a\.mcap: record at byte"):
         open_log(path)

@@ -2,7 +2,9 @@
 
 import io
 import json
+import struct
 import zipfile
+import zlib
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,8 @@ import pandas as pd
 import pytest
 import sklearn
 import skops.io
+from fuzz_bombs import one_member_more, with_content
+from fuzz_mutations import zipped
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from model_data import COLUMNS, dataset, drives
@@ -248,6 +252,47 @@ def test_a_tree_that_leads_out_of_its_arrays_is_refused(model: Model, tmp_path: 
         tree.__setstate__(state)
         path.write_bytes(skops.io.dumps(content))
         with pytest.raises(ModelError, match="a tree leads nowhere"):
+            load_model(path)
+
+
+def test_a_tree_without_nodes_is_refused(model: Model, tmp_path: Path) -> None:
+    path = tmp_path / "model.skops"
+    save_model(model, path)
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    schema = with_content(members["schema.json"], b"node_count", 0)
+    path.write_bytes(zipped({**members, "schema.json": schema}))
+    with pytest.raises(ModelError, match="a tree leads nowhere"):
+        load_model(path)
+
+
+def test_a_file_that_unpacks_to_more_than_a_model_is_refused(model: Model, tmp_path: Path) -> None:
+    path = tmp_path / "model.skops"
+    save_model(model, path)
+    whole = path.read_bytes()
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    array = next(name for name in members if name.endswith(".npy"))
+    zeros = bytes(10**7)
+    packer = zlib.compressobj(1, wbits=-15)
+    deflated = packer.compress(zeros) + packer.flush()
+    header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (%s,), }\n"
+    claims = [header % count for count in (b"400000000", b"4" * 20, b"-1", b"(1, " * 150)]
+    forged = {
+        "claims to unpack": one_member_more(whole, array, deflated, 2**31, 0),
+        "damaged|no model": one_member_more(whole, array, deflated, 100, zlib.crc32(zeros[:100])),
+        "parts": zipped({**members, "schema.json": b"[" + b"[]," * 10**6 + b"1]"}),
+        "RecursionError": zipped({**members, "schema.json": b"[" * 10**5}),
+        "no array": zipped({**members, array: b"PK" * 99}),
+    }
+    for told, content in forged.items():
+        path.write_bytes(content)
+        with pytest.raises(ModelError, match=rf"model\.skops.*({told})"):
+            load_model(path)
+    for claim in claims:
+        npy = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(claim)) + claim
+        path.write_bytes(zipped({**members, array: npy + bytes(64)}))
+        with pytest.raises(ModelError, match=r"model\.skops"):
             load_model(path)
 
 

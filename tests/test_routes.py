@@ -2,6 +2,7 @@
 
 import csv
 import json
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -293,7 +294,13 @@ BAD: dict[str, tuple[str, str]] = {
     "null.geojson": ('{"type": "LineString", "coordinates": [[0, null]]}', "point 0 is no number"),
     "flat.geojson": ('{"type": "LineString", "coordinates": [0, 1]}', "point 0 is no position"),
     "nan.geojson": ('{"type": "LineString", "coordinates": [[0, NaN]]}', "point 0 is not finite"),
+    "deep.geojson": ("[" * 100_000, "RecursionError"),
+    "large.geojson": (f'{{"type": "LineString", "coordinates": [[0, {"9" * 400}]]}}', "too large"),
+    "shape.geojson": ('{"type": "Feature", "properties": [1]}', "AttributeError"),
+    "features.geojson": ('{"type": "FeatureCollection", "features": 7}', "TypeError"),
+    "field.csv": ("x,y\n0,0\n1," + "9" * 200_000, "field larger than field limit"),
     "broken.osm": ("<osm>", "no OSM XML"),
+    "encoding.osm": ('<?xml version="1.0" encoding="foo"?><osm/>', "unknown encoding"),
     "none.osm": ("<osm/>", "no lanelets"),
 }
 
@@ -306,6 +313,18 @@ def test_what_is_no_route_is_refused_with_the_place(name: str, tmp_path: Path) -
     with pytest.raises(CorruptSourceError, match=told) as caught:
         read_routes(path)
     assert str(path) in str(caught.value)
+
+
+def test_a_route_around_the_earth_is_looked_at_within_bounds(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("x,y,z\n" + "\n".join(f"{900_000 * i},0,0" for i in range(50)))
+    tracemalloc.start()
+    try:
+        (route,) = read_routes(path, max_jump=1e6)
+        assert tracemalloc.get_traced_memory()[1] < 200_000_000
+    finally:
+        tracemalloc.stop()
+    assert route.arc_length[-1] == 900_000 * 49
 
 
 def test_points_with_and_without_height_do_not_mix(tmp_path: Path) -> None:

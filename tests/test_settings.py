@@ -11,6 +11,8 @@ from tilestream.apps.compare import compare
 from tilestream.cli.app import COMMANDS, command_of
 from tilestream.cli.fields import help_of
 from tilestream.config import Settings
+from tilestream.errors import UsageError
+from tilestream.sensor import sensor_of
 from tilestream.settings import (
     DriveSettings,
     LabelSettings,
@@ -114,7 +116,7 @@ def test_flags_of_the_first_version_are_still_taken(old: str, new: str) -> None:
 def test_memory_is_an_amount_everywhere() -> None:
     assert PlaceSettings().memory == PlaceSettings(memory="1.5GB").memory == 1_500_000_000
     assert PlaceSettings(memory=2_000_000).memory == 2_000_000
-    with pytest.raises(ts.errors.UsageError, match="'much' is no amount of memory"):
+    with pytest.raises(UsageError, match="'much' is no amount of memory"):
         PlaceSettings(memory="much")
 
 
@@ -131,3 +133,22 @@ def test_a_sensor_is_a_name_or_a_file_or_its_fields(tmp_path: Any) -> None:
     of_file = PlaceSettings(sensor=str(tmp_path / "mine.yaml"))
     assert of_file == PlaceSettings(sensor=fields)
     assert PlaceSettings(sensor="HDL64").looking_sensor == ts.HDL64
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("{name: mine}", "range_max"),
+        ("{name: VLP16, 7: 1}", "7"),
+        ("[{path}]", "names itself"),
+        ("[VLP16, {path}]", "names itself"),
+        ("[[[7]]]", "sensor is 7"),
+    ],
+)
+def test_a_sensor_that_cannot_be_is_named_with_its_file(
+    text: str, told: str, tmp_path: Any
+) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(text.replace("{path}", str(path)))
+    with pytest.raises(UsageError, match=rf"mine\.yaml: .*{told}"):
+        sensor_of(str(path))

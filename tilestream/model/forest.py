@@ -155,13 +155,12 @@ def _of_logarithms(log: bool, target: str) -> bool:
 
 def _ends(tree: Any, factors: int) -> bool:
     """Whether every path through a tree ends, and compares only factors that exist."""
-    if not 0 < tree.node_count <= tree.capacity:  # scikit-learn reads as many nodes as it claims
-        return False
     nodes = np.arange(tree.node_count)
     left, right = tree.children_left, tree.children_right
     inner = left >= 0
     return (
-        tree.n_features == factors
+        tree.node_count > 0
+        and tree.n_features == factors
         and tree.value.shape == (tree.node_count, 1, 1)
         and bool(((left < 0) == (right < 0)).all())
         # Children come after their parent, so every walk ends.
