@@ -283,7 +283,7 @@ def test_a_file_that_unpacks_to_more_than_a_model_is_refused(model: Model, tmp_p
         "damaged|no model": one_member_more(whole, array, deflated, 100, zlib.crc32(zeros[:100])),
         "parts": zipped({**members, "schema.json": b"[" + b"[]," * 10**6 + b"1]"}),
         "RecursionError": zipped({**members, "schema.json": b"[" * 10**5}),
-        "no array": zipped({**members, array: b"PK" * 99}),
+        "magic string": zipped({**members, array: b"PK" * 99}),
     }
     for told, content in forged.items():
         path.write_bytes(content)

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import reprlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -270,24 +271,32 @@ def sensor_of(given: Any) -> Carrier:
     Raises:
         UsageError: no such file or sensor, no mapping of fields, a field that cannot be.
     """
+    return _sensor_of(given, ())
+
+
+def _sensor_of(given: Any, within: tuple[str, ...]) -> Carrier:
+    """As `sensor_of`, inside of some files."""
     if isinstance(given, Sensor | Vehicle):
         return given
     if isinstance(given, str) and given in SENSORS:
         return SENSORS[given]
+    if given in within:
+        raise UsageError(f"{given}: names itself among its sensors")
     if isinstance(given, str):
+        content = _read(given)
         try:
-            return sensor_of(_read(given))
-        except RecursionError:
-            raise UsageError(f"{given}: names itself among its sensors") from None
+            return _sensor_of(content, (*within, given))
         except (UsageError, TypeError) as error:  # TypeError: a key that is no text
-            told = str(error)
-            raise UsageError(told if told.startswith(given) else f"{given}: {told}") from None
+            raise UsageError(f"{given}: {error}") from None
     if isinstance(given, Mapping) and given.keys() == {"sensors"}:
         given = given["sensors"]
     if isinstance(given, list | tuple):
-        return Vehicle(sensors=tuple(part for one in given for part in sensor_of(one).sensors))
+        parts = (part for one in given for part in _sensor_of(one, within).sensors)
+        return Vehicle(sensors=tuple(parts))
     if not isinstance(given, Mapping) or not all(isinstance(key, str) for key in given):
-        raise UsageError(f"sensor is {given!r}: give a name, a file, fields, or a list of these")
+        raise UsageError(
+            f"sensor is {reprlib.repr(given)}: give a name, a file, fields, or a list of these"
+        )
     known = SENSORS.get(str(given.get("name")))
     return Sensor(**(known.model_dump() if known else {}) | dict(given))
 
