@@ -130,9 +130,11 @@ def test_points_that_take_no_bits_are_counted_within_reason(tmp_path: Path) -> N
     path = tmp_path / "a.e57"
     with pye57.E57(str(path), "w") as file:
         file.write_scan_raw(scan_of(local_points()))
-    path.write_bytes(of_constant_points(path.read_bytes(), 4 * 10**12))
-    with pytest.raises(CorruptSourceError, match=r"a\.e57: .*points of at least 0 bits"):
-        open_source(path)
+    whole = path.read_bytes()
+    for count in (4 * 10**12, -1):
+        path.write_bytes(of_constant_points(whole, count))
+        with pytest.raises(CorruptSourceError, match=rf"a\.e57: .* {count} points of at least 0"):
+            open_source(path)
 
 
 def test_a_flipped_byte_is_found_by_its_checksum(tmp_path: Path) -> None:

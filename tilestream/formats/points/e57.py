@@ -177,7 +177,8 @@ def _scan(node: Any, i: int, start: int, path: str, size_bytes: int) -> _Scan:
     coordinates, state = known[0], _STATE[known[0]]
     count: int = points.childCount()
     bits = sum(_bits(prototype[name]) for name in coordinates)
-    if count * max(bits, 1) > 8 * size_bytes:  # a point that takes none is a copy of the last one
+    # a point that takes no bits is a copy of the last one
+    if not 0 <= count * max(bits, 1) <= 8 * size_bytes:
         raise CorruptSourceError(
             f"{path}: scan {i} claims {count} points of at least {bits} bits, the whole file has "
             f"{size_bytes} bytes: it is damaged"
