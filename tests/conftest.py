@@ -26,6 +26,7 @@ LONG = (
     "simulation_run",
     "vicinity",
     "ingest",
+    "fuzz",
     "cli",
     "scale",
     "dashboard",
