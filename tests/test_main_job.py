@@ -578,6 +578,10 @@ LEARNING = "out: run\nmap: {sources: [a.pcd]}\nroutes: [r.csv]\nsimulate: {}\n"
             "out: run\nmap: {sources: [a.pcd]}\ndrives: [{log: a.mcap, name: ../../etc}]",
             r"name",
         ),
+        (JOB + "drives: [{log: /a/..mcap}]", r"'/a/\.\.mcap' cannot name"),
+        (JOB + "drives: [{log: /a/...mcap}]", r"'/a/\.\.\.mcap' cannot name"),
+        (JOB + "drives: [{log: drives/..}]", r"'drives/\.\.' cannot name"),
+        (JOB + "drives: [{log: a.mcap}, {log: .}]", r"'\.' cannot name"),
         (
             "out: run\nmap: {sources: [a.pcd]}\ndrives: [{log: a.mcap}]\nsensor: VLP-16",
             r"known are VLP16",

@@ -19,7 +19,8 @@ from tilestream.sensor import SENSORS, Carrier, Sensor, Vehicle, named
 Positive = Annotated[float, Field(gt=0.0)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Degrees = Annotated[float, Field(ge=0.0, lt=360.0)]
-Name = Annotated[str, Field(pattern=r"^[\w][\w .+-]*$")]
+NAME = r"^[\w][\w .+-]*$"
+Name = Annotated[str, Field(pattern=NAME)]
 """Of a drive: it becomes a folder, so nothing that could lead out of one."""
 
 

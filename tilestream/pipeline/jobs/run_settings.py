@@ -1,6 +1,7 @@
 """The settings of the main job, and how a YAML file gives them."""
 
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Self
@@ -12,6 +13,7 @@ from tilestream.config import Settings
 from tilestream.errors import SourceNotFoundError, UsageError, foreign_errors
 from tilestream.model.registry import COMPETITORS, DEFAULT, RECIPES, UNTRAINED
 from tilestream.settings import (
+    NAME,
     DriveSettings,
     LabelSettings,
     MapSettings,
@@ -83,6 +85,12 @@ class RunSettings(PlaceSettings):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        for drive in self.drives:
+            if re.fullmatch(NAME, drive.group) is None:
+                raise ValueError(
+                    f"has a drive that {drive.log!r} cannot name: give it a name of letters, digits"
+                    " and _ . + - or spaces, the first a letter, a digit or _"
+                )
         names = [drive.group for drive in self.drives]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
