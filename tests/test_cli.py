@@ -25,6 +25,7 @@ from scipy.spatial.transform import Rotation
 import tilestream as ts
 from tilestream.cli import run
 from tilestream.cli.app import COMMANDS, command_of
+from tilestream.cli.printing import err
 from tilestream.cli.progress import progress
 from tilestream.errors import UsageError
 from tilestream.formats.logs import open_log
@@ -210,6 +211,65 @@ def test_a_full_disk_is_told_in_one_line(
     monkeypatch.setattr("tilestream.cli.maps.describe", full)
     told = "error: [Errno 28] No space left on device: make room; the same command continues"
     assert fails(["info", str(pcd)], 1, capsys) == f"{told} where it was"
+
+
+EVIL = "a\x1b]0;taken\x07\x9b31m[red]:car:\u202e"
+"""A name that would steer a terminal."""
+SEEN = "a\\x1b]0;taken"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        (["info", f"{EVIL}.pcd"], 0),
+        (["info", f"{EVIL}.las"], 1),
+        (["info", f"{EVIL}.pcd", f"{EVIL}.pcd"], 2),
+        (["info", f"--{EVIL}"], 2),
+        (["ingest", f"{EVIL}.pcd", f"{EVIL}.las", "--store", f"{EVIL}.zarr"], 1),
+        (["status", f"{EVIL}.zarr", "--debug"], 2),
+        (["run", f"{EVIL}.yaml"], 2),
+    ],
+)
+def test_names_of_files_do_not_steer_the_terminal(
+    arguments: list[str],
+    code: int,
+    pcd: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: Told,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path(f"{EVIL}.pcd").write_bytes(pcd.read_bytes())
+    Path(f"{EVIL}.las").write_text("none")
+    Path(f"{EVIL}.yaml").write_text(f"out: [{EVIL!r}]")
+    assert run(arguments) == code
+    told = "".join(capsys.readouterr())
+    assert SEEN in told
+    assert not set("\x1b\x07\r\x9b\u202e") & set(told)
+    assert "[red]:car:" in told.replace("\n", "")
+
+
+def test_names_in_log_lines_and_names_that_are_no_text_are_shown(
+    store: str, tmp_path: Path
+) -> None:
+    program = [sys.executable, "-m", "tilestream"]
+    how = {"cwd": tmp_path, "capture_output": True}
+    (tmp_path / "\udcff.mcap").write_bytes(b"none")
+    told = subprocess.run([*program, "info", b"\xff.mcap"], **how)
+    assert told.stderr.startswith(b"error: \\xff.mcap: ")
+    where = ["--out", "run", "--scheduler", f"tcp://{EVIL}:1"]
+    told = subprocess.run([*program, "localize", store, "\udcff.mcap", *where], **how)
+    assert f"connecting to tcp://{SEEN}" in told.stderr.decode()
+    assert b"Traceback" not in told.stderr
+    assert not set(b"\x1b\x07") & set(told.stderr)
+
+
+def test_only_our_own_styles_reach_a_terminal() -> None:
+    screen = type(err)(file=io.StringIO(), force_terminal=True, width=100)
+    screen.print(EVIL, style="red", highlight=False)
+    shown = screen.file.getvalue()
+    assert shown.count("\x1b") == 2
+    assert SEEN in shown
 
 
 def test_amounts_of_memory() -> None:

@@ -14,7 +14,7 @@ import typer
 from rich.logging import RichHandler
 from typer.core import TyperGroup
 
-from tilestream.cli.printing import err, out, say
+from tilestream.cli.printing import err, out, say, visible
 from tilestream.errors import (
     PlanError,
     SourceNotFoundError,
@@ -80,6 +80,17 @@ COMMANDS = {
 
 class LateCommands(TyperGroup):
     """A group that imports a command's file when that command is to run, and no other."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command of a line; an error that typer shows itself is made fit to be shown."""
+        try:
+            return super().invoke(ctx)
+        except Exception as error:
+            if hasattr(
+                error, "format_message"
+            ):  # it may name any file, as `tilestream info *` does
+                error.message = visible(error.message)  # type: ignore[attr-defined]
+            raise
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
         """The command of a line."""

@@ -2,11 +2,49 @@
 
 import json
 import sys
+from collections.abc import Iterable
+from typing import Any
 
 from rich.console import Console
+from rich.segment import Segment
 
-out = Console(markup=False)  # [m] is a unit, [Errno 28] a reason: none is a style
-err = Console(stderr=True, markup=False)
+BIDIRECTIONAL = "\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"
+"""Characters that change in which order others are shown."""
+SHOWN_AS = {
+    **{
+        code: f"\\x{code:02x}" for code in (*range(0x20), *range(0x7F, 0xA0)) if code not in b"\n\t"
+    },
+    **{0xDC00 + byte: f"\\x{byte:02x}" for byte in range(0x80, 0x100)},  # a name that is no UTF-8
+    **{ord(sign): f"\\u{ord(sign):04x}" for sign in BIDIRECTIONAL},
+}
+"""What would steer a terminal, or could not be printed, and how it is shown instead."""
+
+
+def visible(text: str) -> str:
+    """A text of whatever origin as one may print it: it can move, colour and hide nothing."""
+    return text.translate(SHOWN_AS)
+
+
+class _Console(Console):
+    """Prints names from files as they are: only our own styles reach the terminal.
+
+    Markup and emoji codes are off: `[m]` is a unit, `[Errno 28]` a reason, `/a:car:/b` a topic.
+    """
+
+    def __init__(self, **how: Any) -> None:
+        super().__init__(markup=False, emoji=False, **how)
+
+    def render(self, renderable: Any, options: Any = None) -> Iterable[Segment]:
+        """All that is printed passes here: lines, tables, progress, log lines, tracebacks."""
+        for segment in super().render(renderable, options):
+            if segment.is_control:
+                yield segment
+            else:
+                yield segment._replace(text=visible(segment.text))
+
+
+out = _Console()
+err = _Console(stderr=True)
 
 
 def say(line: str, to: Console = out) -> None:
