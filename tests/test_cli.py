@@ -2,7 +2,9 @@
 
 import io
 import json
+import os
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -11,12 +13,14 @@ from typing import Any
 
 import logs
 import numpy as np
+import psutil
 import pytest
 import zarr
 from elsewhere import certificates, scheduler_elsewhere
 from logs import START, pose
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from patience import PATIENCE, wait_until
 from points import write_ply
 from rich.console import Console
 from scenes import PLACES, in_map
@@ -200,6 +204,36 @@ def test_an_interrupt_is_told_in_one_line(
     assert run(["info", str(pcd)]) == 130
     told = capsys.readouterr().err.strip()
     assert told == "stopped; the same command continues where it was"
+
+
+@pytest.mark.parametrize("whole_group", [False, True])
+def test_a_run_that_is_terminated_says_so_and_takes_its_workers_along(
+    whole_group: bool, tmp_path: Path
+) -> None:
+    """Batch systems send the signal to the workers too."""
+    job = tmp_path / "job.yaml"
+    job.write_text(f"out: {tmp_path}/run\nsimulate: {{size: small, paths: [III]}}\n")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tilestream", "run", job, "--workers", "2"],
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    book = tmp_path / "run" / "run.json"
+    wait_until(book.exists, "the run has begun")
+    workers = psutil.Process(process.pid).children(recursive=True)
+    assert len(workers) >= 2
+    if whole_group:
+        os.killpg(process.pid, signal.SIGTERM)
+    else:
+        process.terminate()
+    _, told = process.communicate()
+    assert process.returncode == 143
+    assert told.splitlines()[-1] == "stopped; the same command continues where it was"
+    assert "Traceback" not in told
+    assert json.loads(book.read_text())["state"] == "stopped"
+    assert json.loads(book.read_text())["stopped_by"] == "SIGTERM"
+    assert not psutil.wait_procs(workers, timeout=PATIENCE)[1]
 
 
 def test_a_full_disk_is_told_in_one_line(

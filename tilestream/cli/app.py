@@ -1,11 +1,12 @@
 """The command line: its commands, and the only place that exits.
 
 Exit codes: 0 all good; 1 some sources, tiles or scans failed and are listed, the rest is done;
-2 usage, or a job that does not fit its memory or disk; 130 Ctrl-C.
+2 usage, or a job that does not fit its memory or disk; 130 Ctrl-C; 143 SIGTERM.
 """
 
 import errno
 import logging
+import signal
 import sys
 from importlib import import_module
 from typing import Annotated, Any
@@ -26,6 +27,8 @@ from tilestream.version import VERSION
 
 INTERRUPTED = 130
 """Exit code of a command that was stopped with Ctrl-C."""
+TERMINATED = 143
+"""Exit code of a command that was stopped with SIGTERM, as a shell would give it."""
 MAKE_ROOM = ": make room; the same command continues where it was"
 MARKUP: Any = "markdown"  # the other mode takes [m] for a style
 COMMANDS = {
@@ -134,8 +137,21 @@ def root(
         raise typer.Exit
 
 
+class Terminated(SystemExit):
+    """SIGTERM: a batch system, a container or a shell asks for the end."""
+
+    def __str__(self) -> str:
+        return "SIGTERM"
+
+
+def _terminate(*_: object) -> None:
+    """End as after Ctrl-C: workers are closed, a run says that it was stopped."""
+    raise Terminated(TERMINATED)
+
+
 def main() -> None:
     """The entry point: run a command, turn errors into one clear line and an exit code."""
+    signal.signal(signal.SIGTERM, _terminate)
     sys.exit(run(sys.argv[1:]))
 
 
@@ -145,7 +161,7 @@ def run(arguments: list[str]) -> int:
     try:
         app(args=[a for a in arguments if a != "--debug"], prog_name="tilestream")
     except SystemExit as end:
-        if end.code == INTERRUPTED:
+        if end.code in (INTERRUPTED, TERMINATED):
             say("stopped; the same command continues where it was", to=err)
         return int(end.code or 0)
     except (UsageError, SourceNotFoundError, StoreNotFoundError, PlanError) as error:

@@ -62,7 +62,7 @@ class Book:
 
     @contextmanager
     def closed(self) -> Iterator[None]:
-        """Where the job ends early, by an error or Ctrl-C, that is written, and why."""
+        """Where the job ends early, by an error, Ctrl-C or SIGTERM, that is written, and why."""
         try:
             yield
         except BaseException as error:
