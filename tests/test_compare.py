@@ -9,6 +9,7 @@ import distributed
 import numpy as np
 import pandas as pd
 import pytest
+from chromium import calm, chromium_page, opened
 from hypothesis import given
 from hypothesis import strategies as st
 from report_json import charts, source
@@ -257,6 +258,12 @@ def test_where_no_size_suffices_the_best_is_taken_and_listed() -> None:
 
 
 # --- The page and the command
+
+
+def test_a_browser_shows_the_page(found: Comparison, tmp_path: Path) -> None:
+    write_comparison(found, tmp_path, threshold=0.25, cap=CAP)
+    with chromium_page() as browser:
+        calm(opened(browser, tmp_path / "compare.html"))
 
 
 def test_the_page_says_everything_and_is_the_same_every_time(

@@ -1,5 +1,6 @@
 """The report's files and figures: what is written is what was found, in every program."""
 
+import csv
 import json
 import struct
 from dataclasses import replace
@@ -34,7 +35,7 @@ from tilestream.records import Float64
 from tilestream.report import Findings, gate, write_report
 from tilestream.report.charts import MOST, city_map
 from tilestream.report.colours import MISSING, STEPS, palette, scale_of
-from tilestream.report.exports import write_geoparquet
+from tilestream.report.exports import write_csv, write_geoparquet
 from tilestream.report.lines import with_gaps
 from tilestream.report.segments import BRIDGE, reaches, segments, worst_places
 from tilestream.report.summary import plain
@@ -161,6 +162,20 @@ def test_geoparquet_of_a_local_frame_says_that_its_crs_is_unknown(tmp_path: Path
 def test_csv_is_read_back_to_the_bit(found: Findings, folder: Path) -> None:
     read = pd.read_csv(folder / "places.csv", float_precision="round_trip")
     pd.testing.assert_frame_equal(read, found.places, check_dtype=False, check_exact=True)
+
+
+def test_no_text_of_a_csv_is_a_formula_and_numbers_stay(tmp_path: Path) -> None:
+    texts = ["=1+1", "+1", "-2", "@sum", "\t=1", "\r=1", "a\r=1", "", None, "'a"]
+    numbers = np.linspace(-1.0, 1.0, len(texts))
+    write_csv(tmp_path / "a.csv", pd.DataFrame({"route_id": texts, "x": numbers}))
+    with (tmp_path / "a.csv").open(newline="") as file:
+        head, *rows = csv.reader(file)
+    assert head == ["route_id", "x"]
+    assert [text for text, _ in rows] == [
+        *("'=1+1", "'+1", "'-2", "'@sum", "'\t=1", "'\n=1"),
+        *("a\n=1", "", "", "'a"),
+    ]
+    assert [float(x) for _, x in rows] == numbers.tolist()
 
 
 def test_geojson_has_the_segments_in_degrees(found: Findings, folder: Path) -> None:

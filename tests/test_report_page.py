@@ -402,6 +402,30 @@ def test_a_browser_runs_nothing_that_a_file_says(browser: Page, others: dict[str
     calm(tab)
 
 
+def test_no_script_but_ours_runs_and_nobody_is_asked_for_anything(
+    browser: Page, page: Path
+) -> None:
+    """Even if a text of a file came into the page as it is."""
+    tab = opened(browser, page)
+    refused = tab.evaluate(
+        """new Promise((done) => {
+          const refused = [];
+          document.addEventListener("securitypolicyviolation", (event) => {
+            refused.push(event.effectiveDirective);
+            if (refused.length == 4) done(refused.sort());
+          });
+          const script = document.createElement("script");
+          script.textContent = "document.title = 'taken'";
+          document.body.append(script);
+          document.body.insertAdjacentHTML("beforeend",
+            "<img src='data:,' onerror=\\"document.title = 'taken'\\"><img src='http://127.0.0.1:9'>");
+          fetch("http://127.0.0.1:9").catch(() => {});
+        })"""
+    )
+    assert refused == ["connect-src", "img-src", "script-src-attr", "script-src-elem"]
+    assert tab.evaluate("document.title") != "taken"
+
+
 def test_the_page_is_dark_where_the_reader_wants_it_dark(browser: Page, page: Path) -> None:
     colours: dict[str, Any] = {}
     for scheme in ("light", "dark"):

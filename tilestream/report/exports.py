@@ -27,6 +27,8 @@ from tilestream.report.segments import segments
 from tilestream.report.summary import plain, segment
 
 GEOPARQUET = "1.1.0"
+FORMULA = ("=", "+", "-", "@", "\t", "\n")
+"""What a spreadsheet takes for the begin of a formula."""
 POINT_Z = 1001
 """ISO WKB code of a point with z."""
 _WKB = np.dtype([("order", "u1"), ("kind", "<u4"), ("xyz", "<f8", 3)])
@@ -61,8 +63,21 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def write_csv(path: Path, places: pd.DataFrame) -> None:
-    """Write the places; numbers as they are, to the bit, and empty where there is none."""
+    """Write the places; numbers as they are, to the bit, and empty where there is none.
+
+    A text that a spreadsheet would take for a formula has a `'` before it.
+    """
+    texts = places.select_dtypes(exclude=["number", "bool"])
+    safe = {str(name): column.map(_no_formula) for name, column in texts.items()}
+    places = places.assign(**safe)
     write_text(path, places.to_csv(index=False, lineterminator="\n"))
+
+
+def _no_formula(cell: Any) -> Any:
+    if not isinstance(cell, str):
+        return cell
+    cell = cell.replace("\r", "\n")  # which the writer does not take for the end of a line
+    return f"'{cell}" if cell.startswith(FORMULA) else cell
 
 
 def write_geoparquet(path: Path, found: Findings) -> None:
