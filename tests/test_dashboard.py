@@ -1,8 +1,10 @@
 """The Tilestream page: what it counts, that it escapes, that a browser sees tiles change."""
 
+import http.client
 import io
 import json
 import os
+import socket
 import threading
 import time
 import urllib.error
@@ -12,8 +14,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import dask
 import distributed
 import pytest
+from bokeh.util.token import generate_jwt_token
 from chromium import chromium_page
 from elsewhere import scheduler_elsewhere
 from hypothesis import given
@@ -23,7 +27,7 @@ from patience import wait_until
 from PIL import Image
 
 from tilestream.grid import TileKey
-from tilestream.pipeline.engine.cluster import dask_client
+from tilestream.pipeline.engine.cluster import ORIGINS, dask_client
 from tilestream.pipeline.engine.dashboard import (
     GREY,
     RED,
@@ -40,6 +44,7 @@ from tilestream.pipeline.engine.progress import (
     DONE,
     FAILED,
     MOST_FAILURES,
+    NAME,
     REFUSED,
     RUNNING,
     STATUSES,
@@ -263,6 +268,48 @@ def test_a_browser_sees_tiles_change(new_workers: distributed.Client, tmp_path: 
         assert page.evaluate("!!document.querySelector('.navbar a[href=tilestream]')")
     assert coloured(early, RED) < coloured(end, RED)
     assert coloured(early, GREY) > coloured(end, GREY)
+
+
+@pytest.mark.parametrize("page", ["status", NAME])
+def test_only_pages_of_the_dashboard_itself_talk_to_it(
+    workers: distributed.Client, page: str
+) -> None:
+    """Not those of a site that somebody looks at who can reach it, whatever name it goes by."""
+    execute(Plan((Nap(TileKey(0, 0)),), MEMORY), workers, None)
+    port = int(workers.dashboard_link.split(":")[2].split("/")[0])
+    for own in (f"http://127.0.0.1:{port}", f"http://localhost:{port}"):
+        assert handshake(port, page, own) == 101
+    for foreign in ("http://evil.example", f"http://evil.example:{port}", "http://localhost:1"):
+        assert handshake(port, page, foreign) == 403
+
+
+def test_names_of_a_proxy_are_given_to_dask() -> None:
+    with (
+        dask.config.set({ORIGINS: ["city.example:80"]}),
+        dask_client(None, 2, 10**9, host="127.0.0.2") as client,
+    ):
+        port = int(client.dashboard_link.split(":")[2].split("/")[0])
+        where = ("127.0.0.2", f"127.0.0.2:{port}", f"{socket.gethostname()}:{port}")
+        for own in ("city.example", *where[1:]):
+            assert handshake(port, "status", f"http://{own}", where[0]) == 101
+        assert handshake(port, "status", "http://evil.example", where[0]) == 403
+
+
+def handshake(port: int, page: str, origin: str, host: str = "127.0.0.1") -> int:
+    """What the dashboard answers to a page of this origin that asks for a WebSocket."""
+    connection = http.client.HTTPConnection(host, port)
+    wanted = {
+        "Origin": origin,
+        "Connection": "Upgrade",
+        "Upgrade": "websocket",
+        "Sec-WebSocket-Version": "13",
+        "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
+        "Sec-WebSocket-Protocol": f"bokeh, {generate_jwt_token('stranger')}",
+    }
+    connection.request("GET", f"/{page}/ws", headers=wanted)
+    status = connection.getresponse().status
+    connection.close()
+    return status
 
 
 def answers(url: str) -> bool:

@@ -239,6 +239,24 @@ def test_a_local_cluster_listens_on_loopback_alone(workers: distributed.Client) 
     assert heard == {"127.0.0.1"}
 
 
+def test_nobody_joins_a_local_cluster_without_its_certificates(
+    workers: distributed.Client, tmp_path: Path
+) -> None:
+    """Nor as the owner of others, whatever process of this machine it is."""
+    address = workers.scheduler.address
+    assert address.startswith("tls://127.0.0.1:")
+    with (
+        pytest.raises(UsageError, match="wants certificates"),
+        dask_client(address, None, 1),
+    ):
+        pass
+    with dask.config.set({"distributed.comm.timeouts.connect": "2s"}):
+        for stranger in (address.replace("tls:", "tcp:"), address):
+            tls = certificates(tmp_path) if stranger == address else None
+            with pytest.raises(TaskError, match="answers"), dask_client(stranger, 1, 1, tls=tls):
+                pass
+
+
 def test_a_worker_is_one_thread_with_a_limit(workers: distributed.Client) -> None:
     names = [f"{library}_NUM_THREADS" for library in ("NUMBA", "OPENBLAS", "OMP", "MKL")]
     found = workers.run(lambda: [os.environ.get(name) for name in names])
@@ -304,7 +322,7 @@ def test_another_address_than_loopback_is_warned_of(
     monkeypatch.setattr(distributed, "LocalCluster", refuse)
     with pytest.raises(OSError, match="no cluster"), dask_client(None, 2, 1, host="127.0.0.2"):
         pass
-    assert "whoever reaches them can run code here" in caplog.text
+    assert "whoever reaches them can watch the run" in caplog.text
 
 
 def test_a_worker_that_is_busy_is_waited_for_and_that_is_said(

@@ -3,6 +3,7 @@
 import logging
 import os
 import signal
+import socket
 import ssl
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,6 +13,7 @@ from typing import Any
 import dask.config
 import distributed
 from dask.system import CPU_COUNT
+from distributed.comm.addressing import get_address_host
 from distributed.comm.core import CommClosedError
 from distributed.utils import silence_logging_cmgr
 
@@ -21,6 +23,8 @@ from tilestream.pipeline.engine.plan import megabytes
 logger = logging.getLogger(__name__)
 
 LOOPBACK = "127.0.0.1"
+ORIGINS = "distributed.scheduler.dashboard.bokeh-application.allow_websocket_origin"
+"""Dask's setting of whose pages may open a WebSocket to a dashboard."""
 ONE_THREAD = {
     f"{library}_NUM_THREADS": "1" for library in ("NUMBA", "OPENBLAS", "OMP", "MKL", "VECLIB")
 }
@@ -85,7 +89,8 @@ def dask_client(
         memory: what a task may use [bytes]. A worker of the local cluster is restarted when it
             comes near twice that: a broken promise ends in a reason, not in a machine that swaps.
         host: address that the local scheduler and its dashboard listen on.
-        tls: certificates; None: as Dask's own configuration says (`distributed.comm.tls`).
+        tls: certificates; None: a local cluster is encrypted with its own, which only its processes
+            know; for a scheduler elsewhere, Dask's configuration says (`distributed.comm.tls`).
 
     Raises:
         TaskError: nobody answers at the scheduler's address.
@@ -94,27 +99,27 @@ def dask_client(
     security = None if tls is None else tls.security()
     count = CPU_COUNT if workers is None else workers
     if scheduler is not None:
-        logger.info("connecting to %s", scheduler)
+        how = "" if scheduler.startswith("tls:") else ", not encrypted"
+        logger.info("connecting to %s%s", scheduler, how)
         with silence_logging_cmgr(logging.CRITICAL), _connected(scheduler, security) as client:
             yield client
     elif count > 1:
         if host != LOOPBACK:
-            risk = "run code here; use TLS, or a network that you trust"
             logger.warning(
-                "scheduler and dashboard listen on %s: whoever reaches them can %s",
+                "scheduler and dashboard listen on %s: whoever reaches them can watch the run, "
+                "though only certificates let them act",
                 host,
-                risk if tls is None else "watch the run, though only certificates let them act",
             )
-        logger.info("starting %d workers; the first time, they compile kernels for a minute", count)
+        told = "starting %d workers, encrypted; the first time, they compile kernels for a minute"
+        logger.info(told, count)
         with (
-            distributed.LocalCluster(
+            _local_cluster(
                 n_workers=count,
                 threads_per_worker=1,
                 memory_limit=2 * memory,
                 host=host,
                 dashboard_address=f"{host}:0",
-                protocol="tcp://" if tls is None else "tls://",
-                security=security,
+                security=security or distributed.Security.temporary(),
                 silence_logs=logging.CRITICAL,  # what failed is told once, by the outcomes
                 env=ONE_THREAD,
             ) as cluster,
@@ -125,6 +130,28 @@ def dask_client(
             yield client
     else:
         yield None
+
+
+@contextmanager
+def _local_cluster(host: str, **how: Any) -> Iterator[Any]:
+    """A cluster on this machine whose dashboard talks to its own pages alone.
+
+    Dask's default, `*`, lets any site in the browser of someone who can reach it listen. Other
+    names, of a proxy or a tunnel, can be given in Dask's configuration.
+    """
+    given = [origin for origin in dask.config.get(ORIGINS) if origin != "*"]
+    with dask.config.set({ORIGINS: given}):
+        cluster = distributed.LocalCluster(host=host, **how)
+    with cluster:
+        # Bokeh is heavy, and most processes that import this one have no scheduler.
+        from tilestream.pipeline.engine.dashboard import allow_names  # noqa: PLC0415
+
+        names = {"localhost", LOOPBACK}
+        if host != LOOPBACK:
+            reached = get_address_host(cluster.scheduler_address)
+            names |= {host, reached, socket.gethostname(), socket.getfqdn()}
+        allow_names(cluster.scheduler, names)
+        yield cluster
 
 
 class _Client(distributed.Client):
