@@ -143,14 +143,14 @@ def _local_cluster(host: str, **how: Any) -> Iterator[Any]:
     with dask.config.set({ORIGINS: given}):
         cluster = distributed.LocalCluster(host=host, **how)
     with cluster:
-        # Bokeh is heavy, and most processes that import this one have no scheduler.
-        from tilestream.pipeline.engine.dashboard import allow_names  # noqa: PLC0415
-
         names = {"localhost", LOOPBACK}
         if host != LOOPBACK:
             reached = get_address_host(cluster.scheduler_address)
-            names |= {host, reached, socket.gethostname(), socket.getfqdn()}
-        allow_names(cluster.scheduler, names)
+            names |= {host, reached, socket.gethostname().lower(), socket.getfqdn().lower()}
+        port = cluster.scheduler.http_server.port
+        for page in cluster.scheduler.http_application.applications:
+            if hasattr(page, "websocket_origins"):  # it is Bokeh's, which is heavy to import
+                page.websocket_origins.update(f"{name}:{port}" for name in names)
         yield cluster
 
 

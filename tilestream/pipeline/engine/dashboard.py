@@ -124,24 +124,11 @@ def _planned(key: Any) -> str:
     return str(key).partition("#")[0]
 
 
-def allow_names(scheduler: Any, names: Iterable[str]) -> None:
-    """Let the dashboard of a scheduler be used under these names of its machine."""
-    for page in _pages(scheduler):
-        page.websocket_origins.update(
-            f"{name.lower()}:{scheduler.http_server.port}" for name in names
-        )
-
-
-def _pages(scheduler: Any) -> list[BokehTornado]:
-    """What a scheduler shows in browsers; empty without a dashboard."""
-    return [app for app in scheduler.http_application.applications if isinstance(app, BokehTornado)]
-
-
 def _serve(plugin: ProgressPlugin) -> None:
     """Add the page and the route to the server that runs; without a dashboard, the route alone."""
     scheduler = plugin.scheduler
     server = scheduler.http_application
-    pages = _pages(scheduler)
+    pages = [app for app in server.applications if isinstance(app, BokehTornado)]
     prefix = pages[0].prefix if pages else ""
     server.add_handlers(".*$", [(rf"{prefix}/{NAME}\.json", JsonHandler, {"plugin": plugin})])
     if pages:
@@ -151,7 +138,7 @@ def _serve(plugin: ProgressPlugin) -> None:
         ours = BokehApplication(
             shown, scheduler, prefix=prefix or "/", template_variables=variables
         )
-        ours.websocket_origins.clear()
+        ours.websocket_origins.clear()  # what Dask's configuration says here
         ours.websocket_origins.update(pages[0].websocket_origins)
         server.add_application(ours)
         ours.initialize(IOLoop.current())
