@@ -45,10 +45,10 @@ def test_a_moved_block_holds_the_moved_points(city: Path) -> None:
     )
 
 
-def test_two_workers_over_tcp_write_the_bytes_of_a_serial_run(
+def test_two_workers_over_tls_write_the_bytes_of_a_serial_run(
     city: Path, serial: dict[str, str], tmp_path: Path, workers: distributed.Client
 ) -> None:
-    assert all(address.startswith("tcp://") for address in workers.nthreads())
+    assert all(address.startswith("tls://") for address in workers.nthreads())
     run_city(city, str(tmp_path), N, SIZE, client=workers)
     assert len(serial) > 35
     assert digest(tmp_path) == serial
