@@ -110,6 +110,7 @@ def _run(settings: RunSettings, client: Any | None, watch: Watch | None) -> Path
             execute(story.first(), client, book.listening(watch), grow=story.grown)
             if story.estimate is None:
                 story.estimate = story.plan_estimate()
+                book.tasks += story.estimate.tasks
                 _estimate_large(story.estimate, client, book.listening(watch))
         learn(book.tasks, book.outcomes)
         settle(book.tasks, book.failures)
