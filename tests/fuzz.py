@@ -207,6 +207,8 @@ def read_all(numbers: Iterable[int], seed: int, keep: Path | None) -> Iterator[F
             path.write_bytes(content)
             outcome, said = child.read(reader, path)
             outcome = outcome or (SAME if said == truth[reader.name] else OTHER)
+            if outcome == OTHER and reader.sealed:
+                outcome, said = FOREIGN, "damaged, and read as other data"
             if outcome in BAD and keep is not None:
                 keep.mkdir(parents=True, exist_ok=True)
                 (keep / f"{number}-{reader.file}").write_bytes(content)

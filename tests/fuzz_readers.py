@@ -3,6 +3,7 @@
 import functools
 import hashlib
 import json
+import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ from unittest.mock import patch
 import fuzz_bombs as bombs
 import logs
 import numpy as np
+import pandas as pd
 from fuzz_mutations import Mutate, in_chunks, in_json, in_pages, in_zip, mutated
 from mcap.writer import CompressionType
 from model_data import dataset, drives
@@ -20,18 +22,25 @@ from test_lanelet2 import osm
 from test_las import laz_of_chunks
 from test_routes import as_csv, as_kitti, as_tum, geojson, line
 
+import tilestream as ts
+from tilestream.files import Files
 from tilestream.formats import open_source
 from tilestream.formats.logs import open_log
 from tilestream.formats.points.las import write_las
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.formats.projector import METADATA, PROJECTOR
 from tilestream.formats.routes import read_routes
+from tilestream.marks import Mark
 from tilestream.model.file import load_model, save_model
 from tilestream.model.forest import Growth, PaperForest
 from tilestream.model.training import predict, train
+from tilestream.pipeline.jobs.inventory import INVENTORY, Entry, inventory_of, write_inventory
 from tilestream.pipeline.jobs.run_settings import read_settings
+from tilestream.records import Column
 from tilestream.sensor import sensor_of
 from tilestream.simulation.settings import load_preset
+from tilestream.store.manifest import read_manifest
+from tilestream.tables import read_mark, read_tables, write_table
 
 PLACES = drives(2, {"d": 20})[0]
 JOB = """out: run
@@ -68,6 +77,8 @@ class Reader:
     """How it is damaged."""
     bombs: Callable[[bytes], Iterator[bytes]] = lambda _: iter(())
     """Files that are worse than any chance."""
+    sealed: bool = False
+    """Whether it has checksums, so that no damaged one may be read as other data."""
 
     def digest(self, path: Path) -> str:
         """What is in a file, in a few letters."""
@@ -138,6 +149,52 @@ def model(path: Path) -> Iterator[object]:
 def write_model(path: Path) -> None:
     with patch.object(PaperForest, "defaults", asdict(Growth(trees=3))):
         save_model(train(dataset(1, 0.9, {"a": 120, "b": 120}), recipe="paper"), path)
+
+
+def in_store(name: str, inside: str) -> Reader:
+    """A file inside a store of one tile, which is read with all that it says of itself."""
+
+    def at(path: Path) -> Path:
+        found, *_ = sorted((path.parent / "map.zarr").glob(inside))
+        return found
+
+    def make(path: Path) -> None:
+        shutil.rmtree(path.parent / "map.zarr", ignore_errors=True)
+        write_pcd(path.with_name("map.pcd"), far_points(200))
+        ts.ingest(path.with_name("map.pcd"), path.parent / "map.zarr", tile_size=1000.0)
+        shutil.copy(at(path), path)
+
+    def read(path: Path) -> Iterator[object]:
+        shutil.copy(path, at(path))
+        read_manifest.cache_clear()
+        store = ts.open_store(str(path.parent / "map.zarr"))
+        yield [source["points"] for source in store.sources()]  # not their paths: another folder's
+        yield store.made_by(), store.settings, store.state()
+        store.condition().require_whole()
+        for key in store.keys():
+            yield key, store.tile(key).points_mm()
+
+    return Reader(name, "stored", make, read, sealed=True)
+
+
+def write_parquet(path: Path) -> None:
+    frame = pd.DataFrame({"a": np.arange(300.0), "b": ["here"] * 300})
+    columns = [Column("a", "place", "m", "A.", ""), Column("b", "place", "", "B.", "")]
+    write_table(str(path), frame, columns, Mark("done", identity="x", facts={"rows": 300}))
+
+
+def parquet(path: Path) -> Iterator[object]:
+    yield read_tables([str(path)]).to_dict("list")
+    yield read_mark(str(path))
+
+
+def write_list(path: Path) -> None:
+    entries = {"a.parquet": Entry("factors", "x", ("map.zarr",), (1, 2))}
+    write_inventory(Files.at(path.parent), entries)
+
+
+def inventory(path: Path) -> Iterator[object]:
+    yield inventory_of(str(path.parent))
 
 
 def text(content: str) -> Callable[[Path], object]:
@@ -211,4 +268,11 @@ READERS = (
     Reader("sensor", "sensor.yaml", text(SENSOR), sensor, bombs=bombs.of_yaml),
     Reader("preset", "preset.yaml", text(PRESET), preset, bombs=bombs.of_yaml),
     Reader("model", "a.skops", write_model, model, in_zip, bombs.of_model),
+    in_store("tile values", "*_*/points/c/0"),
+    in_store("tile mark", "*_*/points/zarr.json"),
+    in_store("store record", "zarr.json"),
+    in_store("manifest values", "manifest_*/c/0"),
+    in_store("manifest mark", "manifest_*/zarr.json"),
+    Reader("Parquet table", "a.parquet", write_parquet, parquet, sealed=True),
+    Reader("inventory", INVENTORY, write_list, inventory, in_json, bombs.of_json, sealed=True),
 )  # fmt: skip

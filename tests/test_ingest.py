@@ -335,6 +335,22 @@ def test_a_bomb_is_named_and_the_good_source_is_ingested(tmp_path: Path) -> None
     assert ts.open_store(str(tmp_path / "map.zarr")).marks() == alone.marks()
 
 
+def test_a_source_that_needs_too_much_memory_does_not_end_the_ingest_of_others(
+    tmp_path: Path,
+) -> None:
+    rng = np.random.default_rng(5)
+    small, large = tmp_path / "small.pcd", tmp_path / "large.pcd"
+    write_pcd(small, rng.uniform(0.0, 20.0, (1000, 3)))
+    write_pcd(large, rng.uniform(0.0, 20.0, (2_000_000, 3)), encoding="binary_compressed")
+    needed = [scatter.needed_to_open(open_source(str(path)).info()) for path in (small, large)]
+    memory = sum(needed) // 2
+    with pytest.raises(PartialError, match=r"large\.pcd: needs .*--memory"):
+        ts.ingest([small, large], tmp_path / "map.zarr", memory=memory)
+    assert ts.open_store(str(tmp_path / "map.zarr")).condition().whole
+    with pytest.raises(PlanError, match="--memory"):
+        ts.ingest(large, tmp_path / "other.zarr", memory=memory)
+
+
 def test_sources_that_all_fail_leave_the_map_as_it_was(tmp_path: Path) -> None:
     path, url = tmp_path / "a.pcd", tmp_path / "map.zarr"
     write_pcd(path, np.random.default_rng(5).uniform(0.0, 20.0, (1000, 3)))

@@ -49,12 +49,14 @@ def sealed(content: Mapping[str, Any]) -> dict[str, Any]:
     return {**content, SEAL: _seal_of(content)}
 
 
-def unsealed(content: Mapping[str, Any]) -> dict[str, Any]:
+def unsealed(content: Any) -> dict[str, Any]:
     """What was sealed.
 
     Raises:
         ValueError: it is not what it was then.
     """
+    if not isinstance(content, Mapping):
+        raise ValueError("it is no JSON object")
     inside = {name: value for name, value in content.items() if name != SEAL}
     if content.get(SEAL) != _seal_of(inside):
         raise ValueError("its checksum does not fit")

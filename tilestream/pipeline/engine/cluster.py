@@ -141,7 +141,7 @@ def _local_cluster(host: str, **how: Any) -> Iterator[Any]:
     """
     given = [origin for origin in dask.config.get(ORIGINS) if origin != "*"]
     with dask.config.set({ORIGINS: given}):
-        cluster = distributed.LocalCluster(host=host, **how)
+        cluster: Any = distributed.LocalCluster(host=host, **how)
     with cluster:
         names = {"localhost", LOOPBACK}
         if host != LOOPBACK:

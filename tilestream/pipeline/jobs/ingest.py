@@ -22,7 +22,7 @@ from tilestream.marks import hash_of
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.outputs import TileArrays
-from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan
+from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, megabytes
 from tilestream.pipeline.engine.stage import Task
 from tilestream.pipeline.jobs.map_crs import one_crs
 from tilestream.pipeline.stages.merge import merge, merge_tasks
@@ -30,6 +30,7 @@ from tilestream.pipeline.stages.scatter import (
     Fragment,
     SourceSpan,
     fragments_of,
+    needed_to_open,
     scatter,
     scatter_tasks,
 )
@@ -266,7 +267,7 @@ def read_sources(
     scans: ScanSelection | None = None,
 ) -> Reading:
     """What `ingest` begins with; arguments and errors as there."""
-    found = _examine_all(sources, _log_options(points_topic, pose_topic, scans))
+    found = _within(_examine_all(sources, _log_options(points_topic, pose_topic, scans)), memory)
     store = _create_or_resume(str(url), _with_crs(settings, found), found)
     return Reading(store, found, memory, _is_current(store, found))
 
@@ -340,6 +341,23 @@ def _examine(path: str, options: dict[str, Any]) -> Source:
     except (SourceError, OSError) as error:
         return replace(known, reason=str(error))
     return replace(known, info=info, spans=spans)
+
+
+def _within(found: Sequence[Source], memory: int) -> list[Source]:
+    """The sources; one that needs more memory than a task may use says so, if others do not.
+
+    Where none fits, planning refuses the job as a whole.
+    """
+    needed = {s.path: needed_to_open(s.info) for s in found if s.info is not None}
+    if all(need > memory for need in needed.values()):
+        return list(found)
+    told = "needs {} to be opened and may use {}: allow more with --memory"
+    return [
+        replace(s, info=None, reason=told.format(megabytes(needed[s.path]), megabytes(memory)))
+        if needed.get(s.path, 0) > memory
+        else s
+        for s in found
+    ]
 
 
 def _with_crs(settings: IngestSettings, found: Sequence[Source]) -> IngestSettings:

@@ -223,6 +223,12 @@ def scatter_tasks(
     return Plan.of(tasks, memory)
 
 
+def needed_to_open(info: SourceInfo) -> int:
+    """Memory of a process that reads a source, in the smallest blocks [bytes]."""
+    counts = {"resident_bytes": info.resident_bytes, "block_points": MIN_BLOCK_POINTS}
+    return BASE_BYTES + _memory(counts)
+
+
 def add_prints(a: tuple[int, int], b: tuple[int, int]) -> tuple[int, int]:
     """The fingerprint of two sets of points together."""
     return (a[0] + b[0]) % 2**64, (a[1] + b[1]) % 2**64
