@@ -3,6 +3,8 @@
 import errno
 import json
 import shutil
+import subprocess
+import sys
 import zlib
 from collections import Counter
 from collections.abc import Callable
@@ -20,9 +22,10 @@ from scenes import scene
 import tilestream as ts
 from tilestream.apps.verify import repair, verify
 from tilestream.cli import run
-from tilestream.errors import IncompleteError, PartialError, TilestreamError
+from tilestream.errors import IncompleteError, LockedError, PartialError, TilestreamError
 from tilestream.files import Files
 from tilestream.formats.points.pcd import write_pcd
+from tilestream.lock import only_writer
 from tilestream.marks import Mark, sealed, unsealed
 from tilestream.pipeline.jobs.inventory import inventory_of, tables_in
 from tilestream.records import Column
@@ -152,6 +155,50 @@ def test_a_lost_table_is_missed(store: ts.TileStore, tmp_path: Path) -> None:
     (tmp_path / "factors" / first).unlink()
     with pytest.raises(IncompleteError, match=first):
         tables_in(folder)
+
+
+# --- One writer
+
+
+WAITS = """
+import sys, time
+from pathlib import Path
+import tilestream as ts
+
+def watch(outcome, *_):
+    if outcome.stage == "merge":
+        print("merging", flush=True)
+        time.sleep(600)
+
+ts.ingest(sys.argv[2], sys.argv[1], tile_size=10.0, watch=watch)
+"""
+
+
+def test_of_two_clients_in_one_directory_one_works_and_the_other_takes_over_a_dead_one(
+    cloud: Path, reference: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    url = str(tmp_path / "map.zarr")
+    ingest = ["ingest", str(cloud), "--store", url, "--tile-size", "10"]
+    command = [sys.executable, "-c", WAITS, url, str(cloud)]
+    first = subprocess.Popen(command, stdout=subprocess.PIPE)
+    try:
+        assert first.stdout is not None
+        assert first.stdout.readline() == b"merging\n"
+        assert run(ingest) == 1
+        assert f"being written by process {first.pid}" in capsys.readouterr().err
+        assert run(["status", url]) == 1
+        assert f"being written by process {first.pid}" in capsys.readouterr().err
+    finally:
+        first.kill()
+        first.wait()
+    assert run(ingest) == 0
+    assert tree(Path(url)) == tree(reference)
+
+
+def test_a_folder_of_tables_has_one_writer(store: ts.TileStore, tmp_path: Path) -> None:
+    with only_writer(tmp_path), pytest.raises(LockedError, match=str(tmp_path)):
+        ts.factors_along(store, [route()], tmp_path)
+    assert (ts.factors_along(store, [route()], tmp_path)["status"] == "done").all()
 
 
 # --- Checksums

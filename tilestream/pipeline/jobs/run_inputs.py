@@ -135,7 +135,9 @@ def _all_streets(settings: RunSettings) -> tuple[tuple[Route, ...], tuple[str, .
     Raises:
         UsageError: there are none, or none as long as the spacing.
     """
-    found = [Path(name) for source in settings.map.sources for name in sorted(glob(source))]  # noqa: PTH207
+    sources = settings.map.sources
+    named = [[one] if Path(one).exists() else sorted(glob(one)) for one in sources]  # noqa: PTH207
+    found = [Path(name) for names in named for name in names]
     files = [str(place / LANES) for place in found if (place / LANES).is_file()]
     if not files:
         raise UsageError(
