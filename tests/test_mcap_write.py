@@ -67,7 +67,7 @@ def test_truth_is_a_topic_of_its_own_that_must_be_named(tmp_path: Path) -> None:
     assert open_log(path, pose_topic="/ground_truth").T_map_lidar[0, 1, 3] == 4e5 + 0.25
 
 
-def test_a_log_given_up_half_way_does_not_read_as_whole(tmp_path: Path) -> None:
+def test_a_log_given_up_half_way_is_not_there(tmp_path: Path) -> None:
     def interrupted() -> Iterator[Scan]:
         for i in range(600):  # more than a chunk
             yield made_scan(START, i)
@@ -75,7 +75,7 @@ def test_a_log_given_up_half_way_does_not_read_as_whole(tmp_path: Path) -> None:
 
     with pytest.raises(RuntimeError, match="power cut"):
         write_log(tmp_path / "a.mcap", interrupted(), made_poses())
-    assert "cut short" in "\n".join(open_log(tmp_path / "a.mcap").notes)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_scans_out_of_order_are_not_written(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from tilestream.errors import DamagedError, TilestreamError, UsageError
@@ -148,7 +149,13 @@ def _tables(folder: str) -> Findings:
         file = Files.at(folder).under(name)
         if not (entry.failed and not file.there()):
             path = f"{folder}/{name}"
-            yield _wrong(path, partial(_read, path, entry), entry.sources, file.remove)
+            sources = tuple(_seen_from(folder, source) for source in entry.sources)
+            yield _wrong(path, partial(_read, path, entry), sources, file.remove)
+
+
+def _seen_from(folder: str, source: str) -> str:
+    """A source of a table as anybody names it."""
+    return source if "://" in source else os.path.normpath(Path(folder).absolute() / source)
 
 
 def _read(path: str, entry: Entry) -> None:

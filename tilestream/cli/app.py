@@ -164,11 +164,23 @@ def run(arguments: list[str]) -> int:
         if end.code in (INTERRUPTED, TERMINATED):
             say("stopped; the same command continues where it was", to=err)
         return int(end.code or 0)
-    except (UsageError, SourceNotFoundError, StoreNotFoundError, PlanError) as error:
-        return _report(error, debug, 2)
-    except (TilestreamError, OSError) as error:
-        return _report(error, debug, 1)
+    except Exception as error:
+        if _was_terminated(error):  # and something failed on the way out
+            say("stopped; the same command continues where it was", to=err)
+            return TERMINATED
+        if isinstance(error, UsageError | SourceNotFoundError | StoreNotFoundError | PlanError):
+            return _report(error, debug, 2)
+        if isinstance(error, TilestreamError | OSError):
+            return _report(error, debug, 1)
+        raise
     return 0
+
+
+def _was_terminated(error: BaseException | None) -> bool:
+    """Whether an error came while a command ended since it was asked to."""
+    while error is not None and not isinstance(error, Terminated):
+        error = error.__context__
+    return error is not None
 
 
 def _report(error: Exception, debug: bool, code: int) -> int:

@@ -14,12 +14,6 @@ Config = Annotated[str, typer.Argument(help="A YAML file, begun with `tilestream
 Changes = Annotated[
     list[str], typer.Option("--set", help="key=value over the file, e.g. model.seed=1.")
 ]
-Partial = Annotated[
-    bool,
-    typer.Option(
-        "--partial", help="Go on with a map that is not whole; what could see a gap says so."
-    ),
-]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the plan, do nothing.")]
 AsJson = Annotated[bool, typer.Option("--json", help="For machines.")]
 

@@ -9,7 +9,7 @@ from tilestream.apps import compare as comparing
 from tilestream.cli.cluster import HERE, Cluster, on_cluster
 from tilestream.cli.fields import fields, with_settings
 from tilestream.cli.maps import LOG_FIELDS
-from tilestream.cli.options import AsJson, DryRun, Partial, Routes, StoreUrl, numbers, routes_of
+from tilestream.cli.options import AsJson, DryRun, Routes, StoreUrl, numbers, routes_of
 from tilestream.cli.printing import out, print_json, say
 from tilestream.cli.progress import progress
 from tilestream.cli.tables import (
@@ -33,6 +33,7 @@ from tilestream.sensor import SENSORS, sensor_of
 from tilestream.settings import (
     DriveSettings,
     LabelSettings,
+    MapSettings,
     PlaceSettings,
     RegistrationSettings,
     ReportSettings,
@@ -58,6 +59,7 @@ BlindRears = Annotated[
 def localize(
     store: StoreUrl,
     folder: Annotated[str, typer.Option("--out", help="Folder of the tables.")],
+    which_map: Annotated[MapSettings, fields("partial")],
     places: Annotated[PlaceSettings, fields("cell_size", "spacing", "memory")],
     labels: Annotated[LabelSettings, fields("matcher", "true_pose")],
     leaf: Annotated[RegistrationSettings, fields("scan_leaf")],
@@ -69,7 +71,6 @@ def localize(
     starts_per_task: Annotated[
         int | None, typer.Option(help="Split the starts; default: no.")
     ] = None,
-    partial: Partial = False,
     dry_run: DryRun = False,
     as_json: AsJson = False,
     cluster: Cluster = HERE,
@@ -91,7 +92,7 @@ def localize(
         out.print(
             plan_table(
                 localize_drive.plan_localize(
-                    MapPlan.of_store(opened, partial=partial), reading, folder, **how
+                    MapPlan.of_store(opened, partial=which_map.partial), reading, folder, **how
                 )
             )
         )
@@ -105,7 +106,7 @@ def localize(
             reading=reading,
             client=client,
             watch=watch,
-            partial=partial,
+            partial=which_map.partial,
         )
     if as_json:
         print_json({"matcher": registration.told, **error_facts(found)})
@@ -124,12 +125,12 @@ def factors(
     store: StoreUrl,
     route: Routes,
     folder: Annotated[str, typer.Option("--out", help="Folder of the tables.")],
+    which_map: Annotated[MapSettings, fields("partial")],
     places: Annotated[
         PlaceSettings,
         fields("spacing", "sensor", "sensor_height", "cell_size", "project_to", "memory"),
     ],
     which: Annotated[Which, typer.Option(help="The paper's 20, their robust twins.")] = "all",
-    partial: Partial = False,
     dry_run: DryRun = False,
     as_json: AsJson = False,
     cluster: Cluster = HERE,
@@ -140,9 +141,8 @@ def factors(
     if dry_run:
         looking = Looking(sensor, places.cell_size, which, height)
         samples = samples_by_tile(opened.grid, routes, places.spacing)
-        plan = along_routes.plan_factors(
-            MapPlan.of_store(opened, partial=partial), samples, folder, looking, places.memory
-        )
+        seen = MapPlan.of_store(opened, partial=which_map.partial)
+        plan = along_routes.plan_factors(seen, samples, folder, looking, places.memory)
         out.print(plan_table(plan))
         return
     with cluster.client(places.memory) as client, progress() as watch:
@@ -158,7 +158,7 @@ def factors(
             client=client,
             memory=places.memory,
             watch=watch,
-            partial=partial,
+            partial=which_map.partial,
         )
     counts = rows["status"].value_counts()
     if as_json:
@@ -178,6 +178,7 @@ def compare(
     store: StoreUrl,
     route: Routes,
     folder: Annotated[str, typer.Option("--out", help="Folder of the page and the tables.")],
+    which_map: Annotated[MapSettings, fields("partial")],
     places: Annotated[
         PlaceSettings,
         fields("spacing", "sensor_height", "project_to", "memory", spacing=comparing.SPACING),
@@ -195,7 +196,6 @@ def compare(
     cap: Annotated[
         float, typer.Option(help="What 95 % of a tile's estimates must stay within [m].")
     ] = 0.15,
-    partial: Partial = False,
     dry_run: DryRun = False,
     as_json: AsJson = False,
     cluster: Cluster = HERE,
@@ -212,8 +212,11 @@ def compare(
     )
     registration, height = labels.registration, places.sensor_height
     if dry_run:
-        how = (places.spacing, registration, height, VirtualSettings(), places.memory, partial)
-        out.print(plan_table(comparing.plan_compare(opened, routes, folder, choices, *how)))
+        how = (places.spacing, registration, height, VirtualSettings(), places.memory)
+        partial = which_map.partial
+        out.print(
+            plan_table(comparing.plan_compare(opened, routes, folder, choices, *how, partial))
+        )
         return
     with cluster.client(places.memory) as client, progress() as watch:
         found = comparing.compare(
@@ -227,7 +230,7 @@ def compare(
             client=client,
             memory=places.memory,
             watch=watch,
-            partial=partial,
+            partial=which_map.partial,
         )
     content = write_comparison(found, folder, threshold=report.threshold, cap=cap)
     _show_comparison(content, store, folder, as_json)

@@ -15,7 +15,7 @@ from tilestream.files import Files
 from tilestream.lock import only_writer
 from tilestream.marks import sealed, unsealed
 from tilestream.pipeline.engine.executor import Watch, execute
-from tilestream.pipeline.engine.outputs import Parquet
+from tilestream.pipeline.engine.outputs import Parquet, way_to
 from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.engine.stage import Task
 from tilestream.pipeline.stages.drive_scans import DriveScans, Sample
@@ -34,7 +34,7 @@ class Entry:
     identity: str
     """The identity that it has, or will have."""
     sources: tuple[str, ...] = ()
-    """What it is made from besides other tables: logs, the map."""
+    """What it is made from besides other tables, seen from its folder: logs, the map."""
     stamps_ns: tuple[int, ...] = ()
     """Of a table of a drive: the scans in it [ns since the epoch]."""
     failed: str = ""
@@ -165,11 +165,10 @@ def _by_folder(
     for task in tasks:
         if isinstance(task.writes, Parquet):
             reason = (failures or {}).get(task.key, "")
+            sources = tuple(way_to(source, task.writes.path) for source in _sources_of(task))
             for path, identity in task.writes.files(task.identity).items():
                 folder, name = path.rsplit("/", 1)
-                found[folder][name] = Entry(
-                    task.stage, identity, _sources_of(task), _stamps_of(task), reason
-                )
+                found[folder][name] = Entry(task.stage, identity, sources, _stamps_of(task), reason)
     return found
 
 
