@@ -92,6 +92,16 @@ def shared_data() -> Path:
 
 
 @pytest.fixture(scope="session")
+def cases() -> Path:
+    """The folder of small inputs that went wrong; tests that ask for it are skipped without it."""
+    default = Path(__file__).resolve().parents[2] / "shared" / "cases"
+    folder = Path(os.environ.get("TILESTREAM_CASES", default))
+    if not folder.is_dir():
+        pytest.skip(f"no cases at {folder}: set TILESTREAM_CASES to their folder")
+    return folder
+
+
+@pytest.fixture(scope="session")
 def _workers() -> Iterator[Any]:
     # not imported above: the process that only hands tests out reads this file too, and must wait
     with import_module("tilestream.pipeline.engine.cluster").dask_client(

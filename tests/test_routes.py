@@ -86,6 +86,31 @@ def test_every_format_gives_the_same_route(name: str, tmp_path: Path) -> None:
     assert (route.crs, route.dropped) == (None, 0)
 
 
+AS_WRITTEN: dict[str, str] = {
+    "empty rows at the end": "x,y,z\n1.5,0,7\n20,-3.25,7\n\n,,\n  \n",
+    "semicolons": "x;y;z\n1.5;0;7\n20;-3.25;7\n",
+    "decimal commas": "x;y;z\r\n1,5;0;7,000\r\n20;-3,25;7,000\r\n",
+    "tabs": "x\ty\tz\n1.5\t0\t7\n20\t-3.25\t7\n",
+    "quotes and blanks": '"x", "y", "z"\n"1.5", 0 , 7\n"20", -3.25 , 7\n',
+}
+
+
+@pytest.mark.parametrize("kind", AS_WRITTEN)
+def test_csv_as_people_write_it(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text(AS_WRITTEN[kind])
+    assert read_route(path).positions.tolist() == [[1.5, 0, 7], [20, -3.25, 7]]
+
+
+@pytest.mark.parametrize("empty", ["", " ", "nan", "NaN"])
+def test_a_column_of_no_heights_is_no_height(empty: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text(f"x,y,z\n0,0,{empty}\n30,40,{empty}\n")
+    route = read_route(path)
+    assert np.isnan(route.positions[:, 2]).all()
+    assert route.arc_length[-1] == 50
+
+
 # --- real files
 
 
@@ -286,6 +311,9 @@ BAD: dict[str, tuple[str, str]] = {
     "short.csv": ("x,y\n0,0\n1\n", "line 3, column y is no number: ''"),
     "inf.csv": ("x,y\n0,0\n1,inf\n", "line 3, column y is not finite"),
     "blank.csv": ("x,y\n0,0\n\n1,1\n", "line 3 is empty"),
+    "somez.csv": ("x,y,z\n0,0,1\n5,0,\n", "point 1 has no z, others have"),
+    "grouped.csv": ("x;y\n1,000;2,000\n1,200;2,100\n", "'1,000' may have a decimal comma, or one"),
+    "mixed.csv": ("x;y\n1.234,5;0\n8.234,5;0\n", "'1.234,5' may have a decimal comma"),
     "broken.geojson": ('{"type": ', "no GeoJSON"),
     "list.geojson": ("[1, 2]", "no GeoJSON"),
     "point.geojson": ('{"type": "Point", "coordinates": [1, 2]}', "no LineString but Point"),
@@ -330,7 +358,7 @@ def test_a_route_around_the_earth_is_looked_at_within_bounds(tmp_path: Path) -> 
 def test_points_with_and_without_height_do_not_mix(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     path.write_text('{"type": "LineString", "coordinates": [[0, 0, 1], [5, 0]]}')
-    with pytest.raises(CorruptSourceError, match="point 1 is not finite"):
+    with pytest.raises(CorruptSourceError, match="point 1 has no z, others have"):
         read_route(path)
 
 

@@ -14,8 +14,10 @@ from tilestream.errors import (
 )
 from tilestream.formats.logs import LOG_FORMATS, is_log, open_log
 from tilestream.formats.routes.arc_length import resample, route_of
+from tilestream.formats.routes.base import Path3
+from tilestream.formats.routes.csv_file import read_csv
 from tilestream.formats.routes.degrees import metric
-from tilestream.formats.routes.files import Path3, read_csv, read_geojson, read_poses
+from tilestream.formats.routes.files import read_geojson, read_poses
 from tilestream.formats.routes.lanelet2 import read_lanelet2
 from tilestream.formats.routes.write import write_geojson_route, write_tum
 from tilestream.records import Route
@@ -56,7 +58,7 @@ def read_routes(
     * `.tum`, `.txt`, `.kitti`: poses, TUM (stamp x y z qx qy qz qw) or KITTI (12 numbers a row, the
       frame's z axis up, not a camera's); which of the two is told by the numbers in a row;
     * `.csv`: a header that names x and y (or east and north, local_x and local_y, lon and lat) and
-      maybe z;
+      maybe z; parted by commas, semicolons or tabs;
     * `.geojson`, `.json`: every LineString; of a MultiLineString each part;
     * `.osm`: Lanelet2; centre lines of the lanelets for vehicles, joined as long as one follows the
       other without a fork; in `local_x`, `local_y` where every node has them, else degrees;

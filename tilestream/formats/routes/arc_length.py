@@ -44,6 +44,8 @@ def route_of(
     finite = np.isfinite(positions[:, :2] if flat else positions).all(axis=1)
     if not finite.all():
         index = int(np.flatnonzero(~finite)[0])
+        if np.isfinite(positions[index, :2]).all():
+            raise CorruptSourceError(f"{where}: point {index} has no z, others have: all or none")
         raise CorruptSourceError(f"{where}: point {index} is not finite: {positions[index]}")
     known = positions[:, :2] if flat else positions
     kept = _distinct(known)

@@ -1,35 +1,14 @@
-"""Files that draw a path: poses as text (TUM, KITTI), CSV, GeoJSON."""
+"""Files that draw a path: poses as text (TUM, KITTI), GeoJSON."""
 
-import csv
 import json
-import math
-import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from tilestream.errors import CorruptSourceError
+from tilestream.formats.routes.base import Path3, number, text_of
 from tilestream.records import Float64
-
-X_COLUMNS = ("x", "x_m", "east", "east_m", "easting", "local_x", "lon", "longitude")
-Y_COLUMNS = ("y", "y_m", "north", "north_m", "northing", "local_y", "lat", "latitude")
-Z_COLUMNS = ("z", "z_m", "up", "up_m", "height", "height_m", "ele", "elevation", "alt", "altitude")
-DEGREES = "OGC:CRS84"
-"""Longitude and latitude in degrees, in this order."""
-
-
-@dataclass(frozen=True, eq=False)
-class Path3:
-    """A path as a file draws it."""
-
-    route_id: str
-    """Its name in the file, or the file's."""
-    positions: Float64
-    """(n, 3) points, in the file's unit; z is NaN where there is none."""
-    crs: str | None = None
-    """Coordinate reference system, where the file names it."""
 
 
 def read_poses(path: str) -> list[Path3]:
@@ -39,50 +18,21 @@ def read_poses(path: str) -> list[Path3]:
         CorruptSourceError: no rows, or a row that has another count or something that is no number.
     """
     rows: list[list[float]] = []
-    for number, line in enumerate(_text(path).splitlines(), start=1):
+    for row, line in enumerate(text_of(path).splitlines(), start=1):
         words = line.replace(",", " ").split()
         if not words or words[0].startswith("#"):
             continue
         count = len(rows[0]) if rows else len(words)
         if count not in (8, 12) or len(words) != count:
             raise CorruptSourceError(
-                f"{path}: line {number} has {len(words)} numbers; poses have 8 (TUM: stamp x y z "
+                f"{path}: line {row} has {len(words)} numbers; poses have 8 (TUM: stamp x y z "
                 "qx qy qz qw) or 12 (KITTI: 3 x 4 matrix), the same in all rows"
             )
-        rows.append([_number(path, f"line {number}", word) for word in words])
+        rows.append([number(path, f"line {row}", word) for word in words])
     if not rows:
         raise CorruptSourceError(f"{path}: is empty; poses need rows of 8 or 12 numbers")
     columns = [1, 2, 3] if len(rows[0]) == 8 else [3, 7, 11]
     return [Path3(Path(path).stem, np.array(rows)[:, columns])]
-
-
-def read_csv(path: str) -> list[Path3]:
-    """Points of one path; the first row names the columns.
-
-    Raises:
-        CorruptSourceError: no header, no columns for x and y, or a field that is no number.
-    """
-    rows = list(csv.reader(_text(path).splitlines()))
-    if not rows:
-        raise CorruptSourceError(f"{path}: is empty; it needs a header that names x and y")
-    header = [re.split(r"[\s(\[]", name.strip().lower())[0] for name in rows[0]]
-    x, y, z = (_column(header, names) for names in (X_COLUMNS, Y_COLUMNS, Z_COLUMNS))
-    if x is None or y is None:
-        raise CorruptSourceError(
-            f"{path}: its first row names no columns x and y (or east, north; lon, lat) but "
-            f"{', '.join(rows[0])}"
-        )
-    points = np.full((len(rows) - 1, 3), np.nan)
-    for index, row in enumerate(rows[1:]):
-        if not row:
-            raise CorruptSourceError(f"{path}: line {index + 2} is empty")
-        for axis, column in enumerate((x, y, z)):
-            if column is not None:
-                word = row[column] if column < len(row) else ""
-                place = f"line {index + 2}, column {rows[0][column].strip()}"
-                points[index, axis] = _number(path, place, word)
-    crs = DEGREES if header[x] in ("lon", "longitude") else None
-    return [Path3(Path(path).stem, points, crs)]
 
 
 def read_geojson(path: str) -> list[Path3]:
@@ -92,7 +42,7 @@ def read_geojson(path: str) -> list[Path3]:
         CorruptSourceError: not GeoJSON, no lines in it, or a coordinate that is no number.
     """
     try:
-        root = json.loads(_text(path))
+        root = json.loads(text_of(path))
     except json.JSONDecodeError as error:
         raise CorruptSourceError(f"{path}: no GeoJSON ({error})") from error
     if not isinstance(root, dict):
@@ -153,27 +103,6 @@ def _line(path: str, route_id: str, coordinates: object) -> Float64:
         place = f"route {route_id}, point {index}"
         if not isinstance(position, list) or len(position) < 2:
             raise CorruptSourceError(f"{path}: {place} is no position: {position!r}")
-        values = [_number(path, place, value) for value in position[:3]]
+        values = [number(path, place, value) for value in position[:3]]
         points[index, : len(values)] = values
     return points
-
-
-def _column(header: list[str], names: tuple[str, ...]) -> int | None:
-    return next((header.index(name) for name in names if name in header), None)
-
-
-def _number(path: str, place: str, word: object) -> float:
-    try:
-        value = float(word)  # type: ignore[arg-type] # whatever a file holds
-    except (TypeError, ValueError):
-        raise CorruptSourceError(f"{path}: {place} is no number: {word!r}") from None
-    if not math.isfinite(value):
-        raise CorruptSourceError(f"{path}: {place} is not finite: {word!r}")
-    return value
-
-
-def _text(path: str) -> str:
-    try:
-        return Path(path).read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise CorruptSourceError(f"{path}: not a text file ({error})") from error

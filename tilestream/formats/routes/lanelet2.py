@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tilestream.errors import CorruptSourceError
-from tilestream.formats.routes.files import DEGREES, Path3
+from tilestream.formats.routes.base import DEGREES, Path3
 from tilestream.kernels.fixed_order import norms
 from tilestream.records import Float64
 
