@@ -1,11 +1,18 @@
 """Files of routes that went wrong for others, each with its right value."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tilestream.formats.routes import read_route
+import tilestream as ts
+from tilestream.cli import run
+from tilestream.errors import CorruptSourceError, PartialError
+from tilestream.formats.routes import read_all_routes, read_route, read_routes
+from tilestream.pipeline.jobs.run_settings import RunSettings
+
+Told = pytest.CaptureFixture[str]
 
 
 @pytest.mark.parametrize("name", ["trailing_blank_line.csv", "semicolon.csv", "z_empty.csv"])
@@ -14,3 +21,89 @@ def test_csv_is_read_as_people_write_it(name: str, cases: Path) -> None:
     np.testing.assert_array_equal(route.positions[:, :2], [[x, 0.0] for x in range(5, 36)])
     z = np.nan if name == "z_empty.csv" else 0.0
     np.testing.assert_array_equal(route.positions[:, 2], z)
+
+
+@pytest.fixture(scope="module")
+def street(cases: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The map that the routes lie in."""
+    url = str(tmp_path_factory.mktemp("street") / "map.zarr")
+    ts.ingest(cases / "street.pcd", url, tile_size=50.0)
+    return url
+
+
+def test_routes_of_one_name_get_names_of_their_own(cases: Path) -> None:
+    read = read_all_routes(cases / "route" / "same_name_twice.geojson")
+    assert [route.route_id for route in read.routes] == ["Main Street", "Main Street-2"]
+    assert [route.arc_length[-1] for route in read.routes] == [14.0, 16.0]
+    (note,) = read.notes
+    assert "2 routes are named Main Street: here they are Main Street, Main Street-2" in note
+    assert not read.lost
+
+
+BAD_ONES = {
+    "one_line_of_1_mm.geojson": ("long", 30.0, "tiny", "1 different points of 2"),
+    "one_lanelet_without_bounds.osm": ("21-22", 30.0, "23", "lanelet 23 has no left bound"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_ONES)
+def test_one_bad_route_does_not_stop_the_good_ones(name: str, cases: Path) -> None:
+    good, length, bad, why = BAD_ONES[name]
+    read = read_all_routes(cases / "route" / name)
+    (route,) = read.routes
+    assert (route.route_id, route.arc_length[-1]) == (good, pytest.approx(length))
+    assert [lost.route_id for lost in read.lost] == [bad]
+    assert why in read.failures[f"route {bad}"]
+    with pytest.raises(CorruptSourceError, match=why):
+        read_routes(cases / "route" / name)
+
+
+@pytest.mark.parametrize("name", BAD_ONES)
+def test_factors_of_the_good_ones_and_the_bad_ones_listed(
+    name: str, cases: Path, street: str, tmp_path: Path, capsys: Told
+) -> None:
+    _, _, bad, why = BAD_ONES[name]
+    route = ["--route", str(cases / "route" / name), "--out", str(tmp_path / "out")]
+    assert run(["factors", street, *route, "--json"]) == 1
+    told = capsys.readouterr()
+    assert json.loads(told.out)["done"] == 31
+    assert f"route {bad}: " in told.err
+    assert why in told.err
+
+
+def test_factors_along_routes_of_one_name(
+    cases: Path, street: str, tmp_path: Path, capsys: Told
+) -> None:
+    path = cases / "route" / "same_name_twice.geojson"
+    out = ["--out", str(tmp_path / "out"), "--json"]
+    assert run(["factors", street, "--route", str(path), *out]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["done"] == 15 + 17
+    assert "2 routes are named Main Street" in facts["notes"][0]
+
+
+def test_a_comparison_along_the_good_ones(
+    cases: Path, street: str, tmp_path: Path, capsys: Told
+) -> None:
+    path = cases / "route" / "one_line_of_1_mm.geojson"
+    assert run(["compare", street, "--route", str(path), "--out", str(tmp_path / "cmp")]) == 1
+    assert "route tiny: " in capsys.readouterr().err
+    assert (tmp_path / "cmp" / "compare.html").is_file()
+
+
+def test_a_job_along_the_good_ones_lists_the_bad_one(cases: Path, tmp_path: Path) -> None:
+    path = cases / "route" / "one_line_of_1_mm.geojson"
+    values: dict[str, object] = {
+        "out": str(tmp_path / "run"),
+        "map": {"sources": [str(cases / "street.pcd")], "tile_size": 50.0},
+        "routes": [str(path)],
+        "spacing": 5.0,
+        "model": {"recipe": "physics"},
+    }
+    with pytest.raises(PartialError, match=r"route tiny: .*1 different points of 2"):
+        ts.run(RunSettings(**values))
+    told = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert told["state"] == "failed"
+    assert list(told["failures"]) == ["route tiny"]
+    assert any("route tiny is left out" in note for note in told["notes"])
+    assert "route tiny is left out" in (tmp_path / "run" / "report" / "index.html").read_text()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tilestream.errors import CorruptSourceError, CrsError
-from tilestream.formats.routes import read_routes
+from tilestream.formats.routes import read_all_routes, read_routes
 
 
 @pytest.mark.parametrize(
@@ -94,3 +94,14 @@ def test_lanelets_that_no_vehicle_drives_or_that_are_broken(tmp_path: Path) -> N
     lost.write_text(lost.read_text().replace('<node id="101"', '<node id="999"'))
     with pytest.raises(CorruptSourceError, match="node 101 is used and not there"):
         read_routes(lost)
+
+
+def test_a_broken_lanelet_is_left_out(tmp_path: Path) -> None:
+    lanes = {1: ([0, 1], [100, 101]), 2: ([1, 2], [101]), 3: ([2, 3], [102, 103])}
+    path = osm(tmp_path / "a.osm", lanes)
+    path.write_text(path.read_text().replace('<node id="103"', '<node id="999"'))
+    read = read_all_routes(path)
+    assert [r.route_id for r in read.routes] == ["1"]
+    assert [lost.route_id for lost in read.lost] == ["2", "3"]
+    assert "lanelet 2 has no right bound" in read.failures["route 2"]
+    assert "node 103 is used and not there" in read.failures["route 3"]

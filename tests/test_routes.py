@@ -23,13 +23,16 @@ from tilestream.errors import (
     UsageError,
 )
 from tilestream.formats.routes import (
+    read_all_routes,
     read_route,
     read_routes,
     resample,
     route_of,
+    together,
     write_geojson_route,
     write_tum,
 )
+from tilestream.formats.routes.routes_read import distinct
 from tilestream.records import Trajectory
 
 XYZ = np.array([[0.0, 0, 1], [30, 0, 1.5], [30, 40, 2], [-20, 40, 2]])
@@ -393,6 +396,52 @@ def test_several_routes_in_one_file(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="no route 'b'"):
         read_route(path, route_id="b")
     assert read_route(path, route_id="a/2/1").route_id == "a/2/1"
+
+
+def test_names_that_are_taken_are_not_given_again(tmp_path: Path) -> None:
+    assert distinct(["a", "a-2", "a", "b", "a"]) == ["a", "a-2", "a-3", "b", "a-4"]
+    path = geojson(tmp_path / "a.geojson", line(XYZ))
+    read = together([read_all_routes(path), read_all_routes(path)])
+    assert [r.route_id for r in read.routes] == ["a", "a-2"]
+    assert read.notes == ("2 routes are named a: here they are a, a-2",)
+
+
+def test_bad_routes_are_left_out_by_name(tmp_path: Path) -> None:
+    path = geojson(
+        tmp_path / "a.geojson",
+        line(XYZ),
+        line([[5, 5, 5], [5, 5, 5]]),
+        {"type": "LineString", "coordinates": [[0, None]]},
+        line([[0, 0, 0], [0.4, 0, 0]]),
+        {"type": "MultiLineString", "coordinates": [XYZ.tolist(), []]},
+    )
+    broken = tmp_path / "broken.csv"
+    broken.write_text("x,y\n0,far\n")
+    read = together([read_all_routes(path), read_all_routes(broken)]).at_least(1.0)
+    assert [r.route_id for r in read.routes] == ["a", "a/4/0"]
+    failures = {
+        "route a/2": "point 0 is no number",
+        "route a/4/1": "has no coordinates",
+        "route a/1": "1 different points of 2",
+        "route broken": "column y is no number: 'far'",
+        "route a/3": "at most the length of route a/3, 0.40 m",
+    }
+    assert list(read.failures) == list(failures)
+    for name, why in failures.items():
+        assert why in read.failures[name]
+    assert read_route(path, route_id="a").route_id == "a"
+    for unclear in (None, "a/1"):
+        with pytest.raises(CorruptSourceError, match="point 0 is no number"):
+            read_route(path, route_id=unclear)
+
+
+def test_where_no_route_is_good_the_first_says_why(tmp_path: Path) -> None:
+    path = geojson(tmp_path / "a.geojson", line([[5, 5, 5], [5, 5, 5]]))
+    with pytest.raises(CorruptSourceError, match="1 different points of 2"):
+        together([read_all_routes(path)])
+    short = geojson(tmp_path / "b.geojson", line([[0, 0, 0], [1.5, 0, 0]]))
+    with pytest.raises(UsageError, match=r"at most the length of route b, 1\.50 m"):
+        together([read_all_routes(short)]).at_least(2.0)
 
 
 # --- out

@@ -25,6 +25,7 @@ from tilestream.factors.observability import observability as observability
 from tilestream.factors.sample_points import sample_points as sample_points
 from tilestream.factors.table import factors as factors
 from tilestream.formats.logs import ScanSelection as ScanSelection
+from tilestream.formats.routes import read_all_routes as read_all_routes
 from tilestream.formats.routes import read_route as read_route
 from tilestream.formats.routes import read_routes as read_routes
 from tilestream.grid import TileKey as TileKey

@@ -98,7 +98,12 @@ class PartialError(TaskError):
     def __init__(self, what: str, failures: dict[str, str]) -> None:
         lines = "".join(f"\n  {name}: {reason}" for name, reason in sorted(failures.items()))
         super().__init__(what + lines)
+        self.what = what
         self.failures = failures
+
+    def with_more(self, failures: dict[str, str]) -> "PartialError":
+        """The same, with what failed besides."""
+        return PartialError(self.what, {**failures, **self.failures})
 
 
 COPY_AGAIN = "copy it again from where it came from"

@@ -1,12 +1,14 @@
 """Options that several commands have, and what their words mean."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Annotated
 
 import typer
 
-from tilestream.errors import UsageError
-from tilestream.formats.routes import read_routes
-from tilestream.records import Route
+from tilestream.cli.printing import err, say
+from tilestream.errors import PartialError, UsageError
+from tilestream.formats.routes import RoutesRead, read_all_routes, together
 
 StoreUrl = Annotated[str, typer.Argument(help="The tile store.")]
 Routes = Annotated[list[str], typer.Option(help="TUM, KITTI, CSV, GeoJSON, Lanelet2 or MCAP.")]
@@ -32,6 +34,22 @@ def numbers(lists: list[str], option: str) -> list[float]:
         raise UsageError(f"{option} {told}: give numbers, with commas between them") from None
 
 
-def routes_of(files: list[str], project_to: str | None) -> list[Route]:
-    """The routes of all files."""
-    return [route for path in files for route in read_routes(path, project_to=project_to)]
+@contextmanager
+def routes_of(files: list[str], project_to: str | None, spacing: float) -> Iterator[RoutesRead]:
+    """The routes of all files that can be used; their notes are printed.
+
+    Raises:
+        SourceError, UsageError: none of them can be used; says why the first cannot.
+        PartialError: when all is done with the good ones, some cannot be used; lists them, with
+            what else failed.
+    """
+    read = together(read_all_routes(path, project_to=project_to) for path in files)
+    read = read.at_least(spacing)
+    for note in read.notes:
+        say(note, to=err)
+    try:
+        yield read
+    except PartialError as error:
+        raise error.with_more(read.failures) from None
+    if read.failures:
+        raise PartialError(f"{len(read.failures)} routes are left out:", read.failures)

@@ -136,40 +136,43 @@ def factors(
     cluster: Cluster = HERE,
 ) -> None:
     """Compute the factors of the map at every sample point of a route."""
-    opened, routes = open_store(store), routes_of(route, places.project_to)
-    sensor, height = places.looking_sensor, places.sensor_height
-    if dry_run:
-        looking = Looking(sensor, places.cell_size, which, height)
-        samples = samples_by_tile(opened.grid, routes, places.spacing)
-        seen = MapPlan.of_store(opened, partial=which_map.partial)
-        plan = along_routes.plan_factors(seen, samples, folder, looking, places.memory)
-        out.print(plan_table(plan))
-        return
-    with cluster.client(places.memory) as client, progress() as watch:
-        rows = along_routes.factors_along(
-            opened,
-            routes,
-            folder,
-            spacing=places.spacing,
-            sensor=sensor,
-            sensor_height=height,
-            cell_size=places.cell_size,
-            which=which,
-            client=client,
-            memory=places.memory,
-            watch=watch,
-            partial=which_map.partial,
-        )
-    counts = rows["status"].value_counts()
-    if as_json:
-        print_json({"sample_points": len(rows), **{str(k): int(v) for k, v in counts.items()}})
-    else:
-        out.print(factor_table(rows))
-        say(f"The tables are in {folder}/factors")
-    if counts.get("done", 0) < len(rows):
-        bad = rows[rows["status"] != "done"].groupby("reason").size()
-        reasons = {str(reason): f"{count} sample points" for reason, count in bad.items()}
-        raise PartialError(f"{store}: not every sample point has factors:", reasons)
+    opened = open_store(store)
+    with routes_of(route, places.project_to, places.spacing) as read:
+        routes = read.routes
+        sensor, height = places.looking_sensor, places.sensor_height
+        if dry_run:
+            looking = Looking(sensor, places.cell_size, which, height)
+            samples = samples_by_tile(opened.grid, routes, places.spacing)
+            seen = MapPlan.of_store(opened, partial=which_map.partial)
+            plan = along_routes.plan_factors(seen, samples, folder, looking, places.memory)
+            out.print(plan_table(plan))
+            return
+        with cluster.client(places.memory) as client, progress() as watch:
+            rows = along_routes.factors_along(
+                opened,
+                routes,
+                folder,
+                spacing=places.spacing,
+                sensor=sensor,
+                sensor_height=height,
+                cell_size=places.cell_size,
+                which=which,
+                client=client,
+                memory=places.memory,
+                watch=watch,
+                partial=which_map.partial,
+            )
+        counts = rows["status"].value_counts()
+        if as_json:
+            found = {str(status): int(count) for status, count in counts.items()}
+            print_json({"sample_points": len(rows), **found, "notes": list(read.notes)})
+        else:
+            out.print(factor_table(rows))
+            say(f"The tables are in {folder}/factors")
+        if counts.get("done", 0) < len(rows):
+            bad = rows[rows["status"] != "done"].groupby("reason").size()
+            reasons = {str(reason): f"{count} sample points" for reason, count in bad.items()}
+            raise PartialError(f"{store}: not every sample point has factors:", reasons)
 
 
 @on_cluster
@@ -203,37 +206,37 @@ def compare(
     """Compare lidars, ranges and map resolutions along routes, from the map alone."""
     for limit in (report.threshold, cap):
         check_threshold(limit)
-    opened, routes = open_store(store), routes_of(route, places.project_to)
-    choices = comparing.choices_of(
-        [sensor_of(name) for name in sensor],
-        numbers(ranges, "--range-max") or (None,),
-        numbers(blind_rear, "--blind-rear-deg"),
-        numbers(cell_size, "--cell-size"),
-    )
-    registration, height = labels.registration, places.sensor_height
-    if dry_run:
-        how = (places.spacing, registration, height, VirtualSettings(), places.memory)
-        partial = which_map.partial
-        out.print(
-            plan_table(comparing.plan_compare(opened, routes, folder, choices, *how, partial))
+    opened = open_store(store)
+    with routes_of(route, places.project_to, places.spacing) as read:
+        routes = read.routes
+        choices = comparing.choices_of(
+            [sensor_of(name) for name in sensor],
+            numbers(ranges, "--range-max") or (None,),
+            numbers(blind_rear, "--blind-rear-deg"),
+            numbers(cell_size, "--cell-size"),
         )
-        return
-    with cluster.client(places.memory) as client, progress() as watch:
-        found = comparing.compare(
-            opened,
-            routes,
-            folder,
-            choices,
-            spacing=places.spacing,
-            registration=registration,
-            sensor_height=height,
-            client=client,
-            memory=places.memory,
-            watch=watch,
-            partial=which_map.partial,
-        )
-    content = write_comparison(found, folder, threshold=report.threshold, cap=cap)
-    _show_comparison(content, store, folder, as_json)
+        registration, height = labels.registration, places.sensor_height
+        if dry_run:
+            how = (places.spacing, registration, height, VirtualSettings(), places.memory)
+            of_map = (opened, routes, folder, choices)
+            out.print(plan_table(comparing.plan_compare(*of_map, *how, which_map.partial)))
+            return
+        with cluster.client(places.memory) as client, progress() as watch:
+            found = comparing.compare(
+                opened,
+                routes,
+                folder,
+                choices,
+                spacing=places.spacing,
+                registration=registration,
+                sensor_height=height,
+                client=client,
+                memory=places.memory,
+                watch=watch,
+                partial=which_map.partial,
+            )
+        content = write_comparison(found, folder, threshold=report.threshold, cap=cap)
+        _show_comparison({**content, "notes": list(read.notes)}, store, folder, as_json)
 
 
 def _show_comparison(content: dict[str, Any], store: str, folder: str, as_json: bool) -> None:

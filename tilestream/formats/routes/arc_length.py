@@ -81,18 +81,28 @@ def resample(route: Route, spacing: float = 1.0) -> Route:
     Raises:
         UsageError: `spacing` is not positive, or longer than the route.
     """
+    require_length(route, spacing)
     length = route.arc_length[-1]
-    if not 0 < spacing <= length:
-        raise UsageError(
-            f"spacing = {spacing}: must be above 0 and at most the length of route "
-            f"{route.route_id}, {length:.2f} m"
-        )
     # 1e-9: a route of 10 m that sums to 9.999999999 has its last point
     arc_length: Float64 = spacing * np.arange(np.floor(length / spacing + 1e-9) + 1)
     at = np.minimum(arc_length, length)
     positions = _at(route.positions, route.arc_length, at)
     heading = _heading(route.positions, route.arc_length, at)
     return Route(route.route_id, positions, arc_length, heading, route.crs, route.dropped)
+
+
+def require_length(route: Route, spacing: float) -> None:
+    """Refuse a route that is shorter than the distance between its points is to be [m].
+
+    Raises:
+        UsageError: `spacing` is not positive, or longer than the route.
+    """
+    length = route.arc_length[-1]
+    if not 0 < spacing <= length:
+        raise UsageError(
+            f"spacing = {spacing}: must be above 0 and at most the length of route "
+            f"{route.route_id}, {length:.2f} m"
+        )
 
 
 def _distinct(points: Float64) -> list[int]:

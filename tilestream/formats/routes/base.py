@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
-from tilestream.errors import CorruptSourceError
+from tilestream.errors import CorruptSourceError, TilestreamError
 from tilestream.records import Float64
 
 DEGREES = "OGC:CRS84"
@@ -21,6 +21,16 @@ class Path3:
     """(n, 3) points, in the file's unit; z is NaN where there is none."""
     crs: str | None = None
     """Coordinate reference system, where the file names it."""
+
+
+@dataclass(frozen=True)
+class Lost:
+    """A route that cannot be used."""
+
+    route_id: str
+    """Its name in the file, or the file's."""
+    error: TilestreamError
+    """Why, and where."""
 
 
 def text_of(path: str) -> str:

@@ -1,13 +1,13 @@
 """Files that draw a path: poses as text (TUM, KITTI), GeoJSON."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from tilestream.errors import CorruptSourceError
-from tilestream.formats.routes.base import Path3, number, text_of
+from tilestream.formats.routes.base import Lost, Path3, number, text_of
 from tilestream.records import Float64
 
 
@@ -35,11 +35,12 @@ def read_poses(path: str) -> list[Path3]:
     return [Path3(Path(path).stem, np.array(rows)[:, columns])]
 
 
-def read_geojson(path: str) -> list[Path3]:
-    """Every LineString of a GeoJSON file, and each part of every MultiLineString.
+def read_geojson(path: str) -> Sequence[Path3 | Lost]:
+    """Every LineString of a GeoJSON file, and each part of every MultiLineString. One with a
+    coordinate that is no number is lost.
 
     Raises:
-        CorruptSourceError: not GeoJSON, no lines in it, or a coordinate that is no number.
+        CorruptSourceError: not GeoJSON, or no lines in it.
     """
     try:
         root = json.loads(text_of(path))
@@ -48,17 +49,17 @@ def read_geojson(path: str) -> list[Path3]:
     if not isinstance(root, dict):
         raise CorruptSourceError(f"{path}: no GeoJSON: an object is expected at its top")
     crs_name = _crs_name(path, root.get("crs"))
-    found, seen = [], []
+    found: list[Path3 | Lost] = []
+    seen = []
     for index, (name, geometry) in enumerate(_geometries(root, None)):
         kind, coordinates = geometry.get("type"), geometry.get("coordinates")
         seen.append(str(kind))
         route_id = name or (f"{Path(path).stem}/{index}" if index else Path(path).stem)
         if kind == "LineString":
-            found.append(Path3(route_id, _line(path, route_id, coordinates), crs_name))
+            found.append(_line(path, route_id, coordinates, crs_name))
         elif kind == "MultiLineString" and isinstance(coordinates, list):
             for part, line in enumerate(coordinates):
-                part_id = f"{route_id}/{part}"
-                found.append(Path3(part_id, _line(path, part_id, line), crs_name))
+                found.append(_line(path, f"{route_id}/{part}", line, crs_name))
     if not found:
         kinds = ", ".join(sorted(set(seen))) or "no geometry"
         raise CorruptSourceError(f"{path}: holds no LineString but {kinds}")
@@ -95,7 +96,14 @@ def _geometries(node: object, name: str | None) -> Iterator[tuple[str | None, di
         yield name, node
 
 
-def _line(path: str, route_id: str, coordinates: object) -> Float64:
+def _line(path: str, route_id: str, coordinates: object, crs: str | None) -> Path3 | Lost:
+    try:
+        return Path3(route_id, _points(path, route_id, coordinates), crs)
+    except CorruptSourceError as error:
+        return Lost(route_id, error)
+
+
+def _points(path: str, route_id: str, coordinates: object) -> Float64:
     if not isinstance(coordinates, list) or not coordinates:
         raise CorruptSourceError(f"{path}: route {route_id} has no coordinates")
     points = np.full((len(coordinates), 3), np.nan)

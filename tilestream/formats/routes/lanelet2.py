@@ -6,12 +6,13 @@ Format: Lanelet2's OSM XML (a lanelet is a relation with the ways `left` and `ri
 
 import math
 import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from tilestream.errors import CorruptSourceError
-from tilestream.formats.routes.base import DEGREES, Path3
+from tilestream.formats.routes.base import DEGREES, Lost, Path3
 from tilestream.kernels.fixed_order import norms
 from tilestream.records import Float64
 
@@ -34,77 +35,101 @@ class _Lanelet:
     """(n, 3) centre line."""
 
 
-def read_lanelet2(path: str) -> list[Path3]:
+def read_lanelet2(path: str) -> Sequence[Path3 | Lost]:
     """Centre lines of the lanelets for vehicles, in the file's order.
 
     The centre line is the lanelet's own where it has one, else the middle of its bounds, each at
     the same share of its length. Lanelets are joined to one path (`101-102-105`) as long as exactly
-    one follows and it follows that one only.
+    one follows and it follows that one only. A lanelet that lacks a bound or a node is lost.
 
     Coordinates are `local_x`, `local_y` and `ele` (z) where every node of the bounds has them, else
     longitude and latitude in degrees (`Path3.crs` says so), z from `ele` where every node has it.
 
     Raises:
-        CorruptSourceError: no Lanelet2 map, or a lanelet that lacks a bound or a node (names it).
+        CorruptSourceError: no Lanelet2 map, or no lanelets for vehicles in it.
     """
     try:
         root = ET.parse(path).getroot()
     except ET.ParseError as error:
         raise CorruptSourceError(f"{path}: no OSM XML ({error})") from error
-    nodes = {_id(node): node for node in root.iter("node")}
     ways = {_id(way): [str(nd.get("ref")) for nd in way.iter("nd")] for way in root.iter("way")}
     relations = [r for r in root.iter("relation") if _for_vehicles(_tags(r))]
     if not relations:
         raise CorruptSourceError(f"{path}: holds no lanelets for vehicles")
     used = {n for r in relations for m in r.iter("member") for n in ways.get(_ref(m), [])}
-    metric, coordinates = _coordinates(path, nodes, used)
-    lanelets = [_lanelet(path, r, ways, coordinates) for r in relations]
-    crs = None if metric else DEGREES
-    return [
+    nodes = _Nodes.of(path, {_id(n): n for n in root.iter("node") if _id(n) in used})
+    lanelets: list[_Lanelet] = []
+    lost: list[Lost] = []
+    for relation in relations:
+        try:
+            lanelets.append(_lanelet(path, relation, ways, nodes))
+        except CorruptSourceError as error:
+            lost.append(Lost(_id(relation), error))
+    crs = None if nodes.metric else DEGREES
+    paths = [
         Path3("-".join(part.number for part in chain), _joined(chain), crs)
         for chain in _chains(lanelets)
     ]
+    return [*paths, *lost]
 
 
 def _for_vehicles(tags: dict[str, str]) -> bool:
     return tags.get("type") == "lanelet" and tags.get("subtype") not in NOT_FOR_VEHICLES
 
 
-def _coordinates(
-    path: str, nodes: dict[str, ET.Element], used: set[str]
-) -> tuple[bool, dict[str, Float64]]:
-    """Whether coordinates are metric, and x, y, z of each node used."""
-    missing = sorted(used - nodes.keys())
-    if missing:
-        raise CorruptSourceError(f"{path}: node {missing[0]} is used and not there")
-    tags = {number: _tags(nodes[number]) for number in used}
-    metric = all("local_x" in t and "local_y" in t for t in tags.values())
-    has_z = all("ele" in t for t in tags.values())
-    coordinates = {}
-    for number, t in tags.items():
-        node = nodes[number]
-        x, y = (t["local_x"], t["local_y"]) if metric else (node.get("lon"), node.get("lat"))
+@dataclass(frozen=True, eq=False)
+class _Nodes:
+    """Where the nodes are that lanelets for vehicles use."""
+
+    path: str
+    elements: dict[str, ET.Element]
+    tags: dict[str, dict[str, str]]
+    metric: bool
+    """Whether all have `local_x` and `local_y`."""
+    has_z: bool
+    """Whether all have `ele`."""
+
+    @classmethod
+    def of(cls, path: str, elements: dict[str, ET.Element]) -> "_Nodes":
+        tags = {number: _tags(element) for number, element in elements.items()}
+        metric = all("local_x" in t and "local_y" in t for t in tags.values())
+        return cls(path, elements, tags, metric, all("ele" in t for t in tags.values()))
+
+    def line(self, numbers: list[str]) -> Float64:
+        """(n, 3) points of a way.
+
+        Raises:
+            CorruptSourceError: a node is not there, or has no position; names it.
+        """
+        return np.array([self._point(number) for number in numbers])
+
+    def _point(self, number: str) -> list[float]:
+        node, tags = self.elements.get(number), self.tags.get(number, {})
+        if node is None:
+            raise CorruptSourceError(f"{self.path}: node {number} is used and not there")
+        x, y = ("local_x", "local_y") if self.metric else ("lon", "lat")
+        given = tags if self.metric else node
         try:
-            point = [float(x or ""), float(y or ""), float(t["ele"]) if has_z else np.nan]
+            z = float(tags["ele"]) if self.has_z else np.nan
+            return [float(given.get(x) or ""), float(given.get(y) or ""), z]
         except ValueError as error:
-            raise CorruptSourceError(f"{path}: node {number} has no position ({error})") from error
-        coordinates[number] = np.array(point)
-    return metric, coordinates
+            message = f"{self.path}: node {number} has no position ({error})"
+            raise CorruptSourceError(message) from error
 
 
 def _lanelet(
-    path: str, relation: ET.Element, ways: dict[str, list[str]], coordinates: dict[str, Float64]
+    path: str, relation: ET.Element, ways: dict[str, list[str]], nodes: _Nodes
 ) -> _Lanelet:
     number = _id(relation)
     roles = {str(m.get("role")): _ref(m) for m in relation.iter("member") if m.get("type") == "way"}
     bounds = []
     for role in ("left", "right"):
-        nodes = ways.get(roles.get(role, ""), [])
-        if len(nodes) < 2:
+        bound = ways.get(roles.get(role, ""), [])
+        if len(bound) < 2:
             raise CorruptSourceError(f"{path}: lanelet {number} has no {role} bound of 2 nodes")
-        bounds.append(nodes)
+        bounds.append(bound)
     left, right = bounds
-    left_xyz, right_xyz = (np.array([coordinates[n] for n in nodes]) for nodes in bounds)
+    left_xyz, right_xyz = (nodes.line(bound) for bound in bounds)
     if _against(left_xyz, right_xyz):
         right, right_xyz = right[::-1], right_xyz[::-1]
     if not _on_the_left(left_xyz, right_xyz):
@@ -112,7 +137,7 @@ def _lanelet(
     centre = _middle(left_xyz, right_xyz)
     own = ways.get(roles.get("centerline", ""), [])
     if len(own) >= 2:
-        drawn = np.array([coordinates[n] for n in own])
+        drawn = nodes.line(own)
         centre = drawn[::-1] if _against(centre, drawn) else drawn
     return _Lanelet(number, (left[0], right[0]), (left[-1], right[-1]), centre)
 

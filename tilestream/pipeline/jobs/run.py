@@ -86,7 +86,8 @@ def run(
         PlanError: a task does not fit `memory`.
         LockedError: another process writes to the run directory, or to the map that is made.
         IncompleteError: the map that is there is not whole, and not `map.partial`.
-        PartialError: some tasks failed; the message lists them, the rest is done and reported.
+        PartialError: some tasks failed, or some routes cannot be used; the message lists them, the
+            rest is done and reported.
     """
     settings = config if isinstance(config, RunSettings) else read_settings(config)
     check_model(settings)
@@ -106,6 +107,8 @@ def _run(settings: RunSettings, client: Any | None, watch: Watch | None) -> Path
     with book.closed():
         with report_kept(client, settings.folder / "dask-performance.html"):
             inputs = inputs_of(settings, client, watch)
+            book.failures |= inputs.failures
+            book.facts["notes"] = [*inputs.notes, *_on_degraded(settings, inputs)]
             story = _Story(settings, inputs, book)
             execute(story.first(), client, book.listening(watch), grow=story.grown)
             if story.estimate is None:
@@ -121,7 +124,7 @@ def _run(settings: RunSettings, client: Any | None, watch: Watch | None) -> Path
     book.write("failed" if book.failures else "done")
     if book.failures:
         raise PartialError(
-            f"{settings.out}: {len(book.failures)} tasks failed, the rest is done:", book.failures
+            f"{settings.out}: {len(book.failures)} failed, the rest is done:", book.failures
         )
     return settings.folder
 
@@ -299,7 +302,7 @@ def _facts(
         "drives": {d.group: d.model_dump(exclude_defaults=True) for d in inputs.drives},
         "core-seconds by stage, all calls": stages,
         "failures": dict(book.failures),
-        "notes": [*inputs.notes, *_on_degraded(settings, inputs)],
+        "notes": book.facts["notes"],
         "attributions": list(inputs.attributions),
     }
 

@@ -1,14 +1,14 @@
 """What the main job works on: its settings and files."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from glob import glob
 from pathlib import Path
 from typing import Any
 
 from tilestream.errors import ModelError, SourceNotFoundError, UsageError
 from tilestream.formats.logs import ScanSelection, is_log
-from tilestream.formats.routes import read_routes
+from tilestream.formats.routes import RoutesRead, read_all_routes, together
 from tilestream.model.dataset import made_with
 from tilestream.model.file import load_model
 from tilestream.model.training import check_making
@@ -45,6 +45,8 @@ class Inputs:
     """Where to estimate."""
     notes: tuple[str, ...] = ()
     """What a reader of the results must know."""
+    failures: Mapping[str, str] = field(default_factory=dict)
+    """Which routes are left out, and why."""
     attributions: tuple[str, ...] = ()
     """Whose data it is."""
 
@@ -53,16 +55,16 @@ def inputs_of(settings: RunSettings, client: Any | None, watch: Watch | None) ->
     """The files of a job; a simulated city is simulated first, as far as it is not there.
 
     Raises:
-        UsageError: no routes, or two of one name.
-        SourceError: a file that is not there or cannot be read.
+        UsageError: no routes, or all shorter than the spacing.
+        SourceError: a file that is not there, or none of the routes can be used.
     """
     if settings.simulate is None:
         drives = settings.drives
         files = settings.routes or tuple(dict.fromkeys(drive.log for drive in drives))
         if not files:
-            return Inputs(settings.map.sources, drives, *_all_streets(settings))
-        routes, notes = _routes(files, settings), tuple(_other_lidars(settings))
-        return Inputs(settings.map.sources, drives, routes, notes=notes)
+            return _inputs(settings.map.sources, drives, *_all_streets(settings))
+        read, notes = _routes(files, settings), tuple(_other_lidars(settings))
+        return _inputs(settings.map.sources, drives, read.at_least(settings.spacing), notes)
     folder = simulated_folder(settings)
     wanted = settings.simulate
     for drive in simulations(wanted):
@@ -74,15 +76,29 @@ def inputs_of(settings: RunSettings, client: Any | None, watch: Watch | None) ->
         if wanted.paths is None or log.stem in wanted.paths
     ]
     preset = load_preset(wanted.preset)
-    routes = _routes(settings.routes or (str(folder / "routes.geojson"),), settings)
+    read = _routes(settings.routes or (str(folder / "routes.geojson"),), settings)
     if wanted.paths is not None and not settings.routes:
-        routes = tuple(route for route in routes if route.route_id in wanted.paths)
-    return Inputs(
+        asked = tuple(route for route in read.routes if route.route_id in wanted.paths)
+        read = replace(read, routes=asked)
+    inputs = _inputs(
         settings.map.sources or (str(folder / "survey" / "*.laz"),),
         settings.drives or tuple(logs),
-        routes,
-        notes=(f"Simulated, preset {preset.preset}: {preset.note}",),
-        attributions=(ATTRIBUTION,),
+        read.at_least(settings.spacing),
+        (f"Simulated, preset {preset.preset}: {preset.note}",),
+    )
+    return replace(inputs, attributions=(ATTRIBUTION,))
+
+
+def _inputs(
+    sources: tuple[str, ...],
+    drives: tuple[DriveSettings, ...],
+    read: RoutesRead,
+    notes: tuple[str, ...],
+) -> Inputs:
+    """The files of a job, with what is to be told of its routes."""
+    left_out = (f"{name} is left out: {reason}" for name, reason in read.failures.items())
+    return Inputs(
+        sources, drives, read.routes, (*notes, *read.notes, *left_out), failures=read.failures
     )
 
 
@@ -129,7 +145,7 @@ LANES = "lanelet2_map.osm"
 """The lanes that Autoware keeps beside the point clouds of a map."""
 
 
-def _all_streets(settings: RunSettings) -> tuple[tuple[Route, ...], tuple[str, ...]]:
+def _all_streets(settings: RunSettings) -> tuple[RoutesRead, tuple[str, ...]]:
     """The lanes of the map directories among the sources, and what is to be told of them.
 
     Raises:
@@ -144,7 +160,8 @@ def _all_streets(settings: RunSettings) -> tuple[tuple[Route, ...], tuple[str, .
             f"{settings.out}: no routes: give files of routes, drives, or a map directory with "
             f"{LANES} in map.sources"
         )
-    lanes = _routes(files, settings)
+    read = _routes(files, settings)
+    lanes = read.routes
     long = tuple(lane for lane in lanes if lane.arc_length[-1] >= settings.spacing)
     if not long:
         raise UsageError(
@@ -153,21 +170,19 @@ def _all_streets(settings: RunSettings) -> tuple[tuple[Route, ...], tuple[str, .
         )
     told = f"no routes were given: all streets of the map, {len(long)} lanes of {', '.join(files)}"
     short = len(lanes) - len(long)
-    return long, (told + (f"; {short} shorter than the spacing are left out" if short else ""),)
+    told += f"; {short} shorter than the spacing are left out" if short else ""
+    return replace(read, routes=long), (told,)
 
 
-def _routes(files: Sequence[str], settings: RunSettings) -> tuple[Route, ...]:
+def _routes(files: Sequence[str], settings: RunSettings) -> RoutesRead:
+    """The routes of some files, each with a name of its own."""
     of_log = {drive.log: drive for drive in reversed(settings.drives)}
-    found: list[Route] = []
+    parts = []
     for path in files:  # the way of a drive is that of its own poses
         drive = of_log.get(path)
         topics = {} if drive is None else drive.model_dump(include={"pose_topic", "points_topic"})
-        found += read_routes(path, project_to=settings.project_to, **topics)
-    names = [route.route_id for route in found]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise UsageError(f"two routes are named {', '.join(twice)}: give each its own name")
-    return tuple(found)
+        parts.append(read_all_routes(path, project_to=settings.project_to, **topics))
+    return together(parts)
 
 
 def read_map(settings: RunSettings, inputs: Inputs) -> Reading | None:

@@ -1,0 +1,200 @@
+"""Reading routes from any file that draws a path; the format is told by the ending."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from tilestream.errors import (
+    CorruptSourceError,
+    CrsError,
+    SourceError,
+    SourceNotFoundError,
+    UnknownFormatError,
+    foreign_errors,
+)
+from tilestream.formats.logs import LOG_FORMATS, is_log, open_log
+from tilestream.formats.routes.arc_length import route_of
+from tilestream.formats.routes.base import Lost, Path3
+from tilestream.formats.routes.csv_file import read_csv
+from tilestream.formats.routes.degrees import metric
+from tilestream.formats.routes.files import read_geojson, read_poses
+from tilestream.formats.routes.lanelet2 import read_lanelet2
+from tilestream.formats.routes.routes_read import RoutesRead, named
+from tilestream.records import Route
+
+READERS: dict[str, Callable[[str], Sequence[Path3 | Lost]]] = {
+    ".tum": read_poses,
+    ".txt": read_poses,
+    ".kitti": read_poses,
+    ".csv": read_csv,
+    ".geojson": read_geojson,
+    ".json": read_geojson,
+    ".osm": read_lanelet2,
+}
+
+
+def read_all_routes(
+    path: str | Path,
+    *,
+    crs: str | None = None,
+    project_to: str | None = None,
+    max_jump: float = 1000.0,
+    z_offset: float | None = None,
+    pose_topic: str | None = None,
+    points_topic: str | None = None,
+) -> RoutesRead:
+    """The routes in a file that can be used, and which cannot and why. Formats, known by the
+    ending:
+
+    * `.tum`, `.txt`, `.kitti`: poses, TUM (stamp x y z qx qy qz qw) or KITTI (12 numbers a row, the
+      frame's z axis up, not a camera's); which of the two is told by the numbers in a row;
+    * `.csv`: a header that names x and y (or east and north, local_x and local_y, lon and lat) and
+      maybe z; parted by commas, semicolons or tabs;
+    * `.geojson`, `.json`: every LineString; of a MultiLineString each part;
+    * `.osm`: Lanelet2; centre lines of the lanelets for vehicles, joined as long as one follows the
+      other without a fork; in `local_x`, `local_y` where every node has them, else degrees;
+    * a log (`.mcap`): its poses, see `logs.open_log`.
+
+    Points that repeat the last one within 1 cm are dropped and counted. A path that turns back is
+    kept, the heading follows it. The order of a file's routes is the file's. Where several have one
+    name, the second is called `name-2`, and so on, which is noted.
+
+    Coordinates in degrees (how they are told: `degrees.metric`) are refused unless `project_to`
+    says where to.
+
+    Args:
+        path: the file.
+        crs: coordinate reference system of the file, where it does not say.
+        project_to: a metric CRS (any name that pyproj knows) to project degrees to.
+        max_jump: longest distance between successive points [m].
+        z_offset: added to z, so that the route lies on the road: minus the height of the recorded
+            frame. None: z as it is in the file; no z for a log, whose poses are the lidar's.
+        pose_topic: topic of the poses of a log.
+        points_topic: topic of the scans of a log, of whose lidar its poses are.
+
+    Returns:
+        The routes, those that are lost, and notes. A file that cannot be read at all is lost as a
+        whole.
+
+    Raises:
+        SourceNotFoundError: no such file.
+        UnknownFormatError: an ending of no supported format.
+        CrsError: degrees without `project_to`, or a CRS that cannot be used.
+    """
+    name = str(path)
+    lift = z_offset or (np.nan if is_log(name) and z_offset is None else 0.0)
+    try:
+        with foreign_errors(CorruptSourceError, f"{name}: cannot be read as routes"):
+            drawn = _drawn(name, pose_topic, points_topic)
+            paths = [part for part in drawn if isinstance(part, Path3)]
+            crs = crs or next((part.crs for part in paths), None)
+            by_hand = READERS.get(Path(name).suffix.lower(), read_poses) is not read_poses
+            positions = [part.positions for part in paths]
+            points = metric(name, positions, crs, project_to, by_hand) if paths else []
+    except (SourceNotFoundError, UnknownFormatError, CrsError):
+        raise
+    except SourceError as error:
+        return RoutesRead(lost=(Lost(Path(name).stem, error),))
+    lost = [part for part in drawn if isinstance(part, Lost)]
+    found = []
+    for part, xyz in zip(paths, points, strict=True):
+        try:
+            found.append(
+                route_of(
+                    part.route_id,
+                    xyz + np.array([0.0, 0.0, lift]),
+                    crs=project_to or crs,
+                    max_jump=max_jump,
+                    where=f"{name}: route {part.route_id}",
+                )
+            )
+        except SourceError as error:
+            lost.append(Lost(part.route_id, error))
+    routes, notes = named(found)
+    return RoutesRead(routes, tuple(lost), tuple(f"{name}: {note}" for note in notes))
+
+
+def read_routes(
+    path: str | Path,
+    *,
+    crs: str | None = None,
+    project_to: str | None = None,
+    max_jump: float = 1000.0,
+    z_offset: float | None = None,
+    pose_topic: str | None = None,
+    points_topic: str | None = None,
+) -> list[Route]:
+    """All routes in a file; arguments as for `read_all_routes`, which goes on where this refuses.
+
+    Raises:
+        SourceNotFoundError: no such file.
+        UnknownFormatError: an ending of no supported format.
+        CorruptSourceError: no route in it, fewer than 2 different points, a number that is missing
+            or not finite (names the place); no plausible road (steeper than 1:2).
+        PoseError: a jump longer than `max_jump`; names the point and the distance.
+        CrsError: degrees without `project_to`, or a CRS that cannot be used.
+    """
+    read = read_all_routes(
+        path,
+        crs=crs,
+        project_to=project_to,
+        max_jump=max_jump,
+        z_offset=z_offset,
+        pose_topic=pose_topic,
+        points_topic=points_topic,
+    )
+    for lost in read.lost:
+        raise lost.error
+    return list(read.routes)
+
+
+def read_route(
+    path: str | Path,
+    *,
+    route_id: str | None = None,
+    crs: str | None = None,
+    project_to: str | None = None,
+    max_jump: float = 1000.0,
+    z_offset: float | None = None,
+    pose_topic: str | None = None,
+) -> Route:
+    """The one route of a file, or the one with this id; otherwise as `read_routes`.
+
+    Raises:
+        SourceError: several routes and no id, or none with this id; names those that are there.
+    """
+    read = read_all_routes(
+        path,
+        crs=crs,
+        project_to=project_to,
+        max_jump=max_jump,
+        z_offset=z_offset,
+        pose_topic=pose_topic,
+    )
+    routes = read.routes
+    chosen = [r for r in routes if route_id in (None, r.route_id)]
+    if read.lost and (route_id is None or not chosen):
+        raise read.lost[0].error
+    if len(chosen) != 1:
+        ids = ", ".join(r.route_id for r in routes[:20]) + (", ..." if len(routes) > 20 else "")
+        asked = f"no route {route_id!r}" if route_id else "more than one route"
+        raise SourceError(f"{path}: {asked}; name one of its {len(routes)}: {ids}")
+    return chosen[0]
+
+
+def _drawn(path: str, pose_topic: str | None, points_topic: str | None) -> Sequence[Path3 | Lost]:
+    """The paths that a file draws, in its own coordinates; at least one, or one that is lost."""
+    ending = Path(path).suffix.lower()
+    if is_log(path):
+        poses = open_log(path, points_topic=points_topic, pose_topic=pose_topic).trajectory
+        return [Path3(Path(path).stem, poses.T_map_lidar[:, :3, 3].copy())]
+    if not Path(path).is_file():
+        raise SourceNotFoundError(f"{path}: no such file; check the path")
+    if ending not in READERS:
+        known = ", ".join([*READERS, *map(str, LOG_FORMATS)])
+        raise UnknownFormatError(f"{path}: the ending {ending!r} is of no route; known are {known}")
+    drawn = READERS[ending](path)
+    if not drawn:
+        raise CorruptSourceError(f"{path}: holds no route")
+    return drawn
