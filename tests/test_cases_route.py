@@ -8,7 +8,7 @@ import pytest
 
 import tilestream as ts
 from tilestream.cli import run
-from tilestream.errors import CorruptSourceError, PartialError
+from tilestream.errors import CorruptSourceError, CrsError, PartialError
 from tilestream.formats.routes import read_all_routes, read_route, read_routes
 from tilestream.pipeline.jobs.run_settings import RunSettings
 
@@ -107,3 +107,15 @@ def test_a_job_along_the_good_ones_lists_the_bad_one(cases: Path, tmp_path: Path
     assert list(told["failures"]) == ["route tiny"]
     assert any("route tiny is left out" in note for note in told["notes"])
     assert "route tiny is left out" in (tmp_path / "run" / "report" / "index.html").read_text()
+
+
+def test_what_an_editor_has_marked_as_deleted_is_not_there(cases: Path) -> None:
+    route = read_route(cases / "route" / "josm_deleted.osm")
+    assert route.route_id == "21-22"
+    assert route.positions[[0, -1], 0].tolist() == [5.0, 35.0]
+
+
+@pytest.mark.parametrize("project_to", [None, "EPSG:6677"])
+def test_metres_as_latitudes_are_said_to_be_metres(project_to: str | None, cases: Path) -> None:
+    with pytest.raises(CrsError, match=r"longitude 1679, latitude -802 .*look like metres"):
+        read_routes(cases / "route" / "metres_in_lat.osm", project_to=project_to)

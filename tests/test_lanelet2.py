@@ -105,3 +105,17 @@ def test_a_broken_lanelet_is_left_out(tmp_path: Path) -> None:
     assert [lost.route_id for lost in read.lost] == ["2", "3"]
     assert "lanelet 2 has no right bound" in read.failures["route 2"]
     assert "node 103 is used and not there" in read.failures["route 3"]
+
+
+@pytest.mark.parametrize("mark", ['action="delete"', 'visible="false"'])
+@pytest.mark.parametrize(("element", "lost"), [("relation", []), ("way", ["2"]), ("node", ["2"])])
+def test_deleted_elements_are_not_there(
+    mark: str, element: str, lost: list[str], tmp_path: Path
+) -> None:
+    path = osm(tmp_path / "a.osm", {1: ([0, 1], [100, 101]), 2: ([1, 2], [101, 102])})
+    number = {"relation": "2", "way": "22", "node": "102"}[element]
+    text = path.read_text()
+    path.write_text(text.replace(f'<{element} id="{number}"', f'<{element} {mark} id="{number}"'))
+    read = read_all_routes(path)
+    assert [r.route_id for r in read.routes] == ["1"]
+    assert [one.route_id for one in read.lost] == lost

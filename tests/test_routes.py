@@ -291,6 +291,19 @@ def test_the_names_of_columns_tell_degrees(tmp_path: Path) -> None:
         read_route(path)
 
 
+def test_degrees_that_are_none_are_refused_with_what_they_look_like(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("lat,lon\n139.1,35.0\n139.1,36.5\n")
+    with pytest.raises(CrsError, match=r"longitude 35, latitude 139\.1 .*look swapped"):
+        read_route(path, project_to="EPSG:6677")
+    path.write_text("lat,lon\n-12000,35\n-12000,360\n")
+    with pytest.raises(CrsError, match="look like metres"):
+        read_route(path)
+    path.write_text("lat,lon\n0,48\n0,49.8\n")
+    with pytest.raises(CrsError, match="EPSG:6677 cannot hold its places"):
+        read_route(path, project_to="EPSG:6677")
+
+
 def test_poses_of_a_camera_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "00.txt"
     path.write_text("\n".join(f"1 0 0 {0.1 * i} 0 1 0 0.01 0 0 1 {2 * i}" for i in range(50)))

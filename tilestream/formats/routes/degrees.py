@@ -30,7 +30,8 @@ def metric(
         (n, 3) points of each path [m].
 
     Raises:
-        CrsError: degrees without `project_to`, metres with it, or a CRS that cannot be used.
+        CrsError: degrees without `project_to`, or that no place on earth has; metres with it; or a
+            CRS that cannot be used.
     """
     system, target = _crs(path, crs), _crs(path, project_to)
     if target is not None and target.is_geographic:
@@ -40,6 +41,7 @@ def metric(
         if project_to is not None:
             raise CrsError(f"{path}: is not in degrees, so it cannot be projected to {project_to}")
         return points
+    _check_on_earth(path, points)
     if target is None:
         raise CrsError(
             f"{path}: coordinates in degrees, not metres (or a path of less than a metre); project "
@@ -49,8 +51,28 @@ def metric(
     projected = []
     for xyz in points:
         x, y = to_map.transform(xyz[:, 0], xyz[:, 1])
+        known = np.isfinite(xyz[:, :2]).all(axis=1)
+        if not np.isfinite(np.stack([x, y])[:, known]).all():
+            raise CrsError(f"{path}: {project_to} cannot hold its places; name the map's CRS")
         projected.append(np.column_stack([x, y, xyz[:, 2]]))
     return projected
+
+
+def _check_on_earth(path: str, points: list[Float64]) -> None:
+    """Refuse longitudes and latitudes that no place on earth has, with what they look like."""
+    every = np.concatenate(points)
+    beyond = np.flatnonzero((np.abs(every[:, 0]) > 180) | (np.abs(every[:, 1]) > 90))
+    if not len(beyond):
+        return
+    x, y = every[beyond[0], :2]
+    swapped = np.abs(every[:, 0]).max() <= 90 and np.abs(every[:, 1]).max() <= 180
+    like = (
+        "latitude and longitude look swapped: swap them"
+        if swapped
+        else "these look like metres: give them as metres (in Lanelet2: local_x and local_y of "
+        "every node), or project them back to degrees"
+    )
+    raise CrsError(f"{path}: longitude {x:g}, latitude {y:g} is no place on earth; {like}")
 
 
 def _crs(path: str, name: str | None) -> CRS | None:

@@ -40,7 +40,8 @@ def read_lanelet2(path: str) -> Sequence[Path3 | Lost]:
 
     The centre line is the lanelet's own where it has one, else the middle of its bounds, each at
     the same share of its length. Lanelets are joined to one path (`101-102-105`) as long as exactly
-    one follows and it follows that one only. A lanelet that lacks a bound or a node is lost.
+    one follows and it follows that one only. A lanelet that lacks a bound or a node is lost. What
+    an editor has marked as deleted is not there.
 
     Coordinates are `local_x`, `local_y` and `ele` (z) where every node of the bounds has them, else
     longitude and latitude in degrees (`Path3.crs` says so), z from `ele` where every node has it.
@@ -52,12 +53,12 @@ def read_lanelet2(path: str) -> Sequence[Path3 | Lost]:
         root = ET.parse(path).getroot()
     except ET.ParseError as error:
         raise CorruptSourceError(f"{path}: no OSM XML ({error})") from error
-    ways = {_id(way): [str(nd.get("ref")) for nd in way.iter("nd")] for way in root.iter("way")}
-    relations = [r for r in root.iter("relation") if _for_vehicles(_tags(r))]
+    ways = {_id(w): [str(nd.get("ref")) for nd in w.iter("nd")] for w in _there(root, "way")}
+    relations = [r for r in _there(root, "relation") if _for_vehicles(_tags(r))]
     if not relations:
         raise CorruptSourceError(f"{path}: holds no lanelets for vehicles")
     used = {n for r in relations for m in r.iter("member") for n in ways.get(_ref(m), [])}
-    nodes = _Nodes.of(path, {_id(n): n for n in root.iter("node") if _id(n) in used})
+    nodes = _Nodes.of(path, {_id(n): n for n in _there(root, "node") if _id(n) in used})
     lanelets: list[_Lanelet] = []
     lost: list[Lost] = []
     for relation in relations:
@@ -71,6 +72,15 @@ def read_lanelet2(path: str) -> Sequence[Path3 | Lost]:
         for chain in _chains(lanelets)
     ]
     return [*paths, *lost]
+
+
+def _there(root: ET.Element, kind: str) -> list[ET.Element]:
+    """The elements of a kind but for those that an editor has marked as deleted."""
+    return [
+        element
+        for element in root.iter(kind)
+        if element.get("action") != "delete" and element.get("visible") != "false"
+    ]
 
 
 def _for_vehicles(tags: dict[str, str]) -> bool:

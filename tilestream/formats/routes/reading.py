@@ -80,7 +80,8 @@ def read_all_routes(
     Raises:
         SourceNotFoundError: no such file.
         UnknownFormatError: an ending of no supported format.
-        CrsError: degrees without `project_to`, or a CRS that cannot be used.
+        CrsError: degrees without `project_to`, or that no place on earth has; or a CRS that cannot
+            be used.
     """
     name = str(path)
     lift = z_offset or (np.nan if is_log(name) and z_offset is None else 0.0)
