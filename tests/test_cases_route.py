@@ -9,7 +9,7 @@ import pytest
 import tilestream as ts
 from tilestream.cli import run
 from tilestream.errors import CorruptSourceError, CrsError, PartialError
-from tilestream.formats.routes import read_all_routes, read_route, read_routes
+from tilestream.formats.routes import read_all_routes, read_route, read_routes, resample
 from tilestream.pipeline.jobs.run_settings import RunSettings
 
 Told = pytest.CaptureFixture[str]
@@ -119,3 +119,20 @@ def test_what_an_editor_has_marked_as_deleted_is_not_there(cases: Path) -> None:
 def test_metres_as_latitudes_are_said_to_be_metres(project_to: str | None, cases: Path) -> None:
     with pytest.raises(CrsError, match=r"longitude 1679, latitude -802 .*look like metres"):
         read_routes(cases / "route" / "metres_in_lat.osm", project_to=project_to)
+
+
+def test_standing_with_noise_adds_no_length(cases: Path) -> None:
+    route = read_route(cases / "route" / "standstill_with_noise.tum")
+    assert route.arc_length[-1] == pytest.approx(20.0, abs=0.1)
+    assert len(resample(route).positions) in (20, 21)
+
+
+def test_a_drive_recorded_in_two_pieces_is_two_routes(cases: Path) -> None:
+    read = read_all_routes(cases / "route" / "gap_of_100_m.tum")
+    assert [r.route_id for r in read.routes] == ["gap_of_100_m", "gap_of_100_m-2"]
+    assert [r.arc_length[-1] for r in read.routes] == [pytest.approx(20.0)] * 2
+    assert [r.positions[0, 0] for r in read.routes] == [0.0, 120.0]
+    cut, named = read.notes
+    assert "cut where nobody drove: at a gap of 100.0 m after (20.0, 0.0)" in cut
+    assert "gap_of_100_m, gap_of_100_m-2" in named
+    assert not read.lost

@@ -237,6 +237,18 @@ def test_one_scan_is_chosen_per_metre_of_the_drive(tmp_path: Path) -> None:
             assert sample.stamp_ns == log.stamps_ns[sample.scan]
 
 
+def test_a_drive_that_stands_is_sampled_there_once(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    x = np.r_[np.arange(0, 5, 0.25), np.full(300, 5.0), np.arange(5.25, 10.25, 0.25)]
+    y = rng.normal(0, 0.02, len(x))
+    poses = {i: pose(x=x[i], y=y[i]) for i in range(len(x))}
+    path = write_drive(
+        tmp_path / "waits.mcap", dict.fromkeys(poses, np.ones((1, 3))), poses, period_s=0.1
+    )
+    chosen = choose_samples(open_log(path), ts.ScanSelection(), 1.0)
+    assert [round(x[sample.scan]) for sample in chosen] == list(range(11))
+
+
 def test_every_column_is_documented_in_the_files(plain: tuple[pd.DataFrame, Path]) -> None:
     for kind, known in (("errors", ERROR_COLUMNS), ("starts", START_COLUMNS)):
         for path in (plain[1] / kind).glob("*.parquet"):

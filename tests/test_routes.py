@@ -6,6 +6,7 @@ import tracemalloc
 from pathlib import Path
 from typing import Any
 
+import logs
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -22,6 +23,7 @@ from tilestream.errors import (
     UnknownFormatError,
     UsageError,
 )
+from tilestream.formats.motion import along
 from tilestream.formats.routes import (
     read_all_routes,
     read_route,
@@ -391,6 +393,86 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         read_routes(binary)
 
 
+# --- poses that stand, and poses with gaps
+
+
+def as_poses(path: Path, xyz: Any, stamps: Any) -> Path:
+    rows = zip(np.asarray(stamps).tolist(), np.asarray(xyz, dtype=float).tolist(), strict=True)
+    lines = [f"{t!r} {x!r} {y!r} {z!r} 0 0 0 1" for t, (x, y, z) in rows]
+    path.write_text("\n".join(lines))
+    return path
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.03])
+@pytest.mark.parametrize("waits", [(0.0,), (15.0,), (30.0,), (0.0, 10.0, 11.0, 30.0)])
+def test_waiting_adds_no_length(waits: tuple[float, ...], noise: float, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    x = np.sort(np.concatenate([np.arange(301) / 10, *(np.full(900, at) for at in waits)]))
+    xyz = np.column_stack([x, 0 * x, 0 * x]) + rng.normal(0, noise, (len(x), 3))
+    route = read_route(as_poses(tmp_path / "a.tum", xyz, np.arange(len(x)) / 10))
+    assert route.arc_length[-1] == pytest.approx(30.0, abs=0.3 + 3 * noise)
+    arc = along(xyz)
+    assert (np.diff(arc) >= 0).all()
+    assert np.abs(arc - x).max() < 0.3 + 5 * noise
+
+
+def test_along_a_path_that_never_stands_is_its_length() -> None:
+    xyz = np.cumsum(np.random.default_rng(0).uniform(0.5, 2, (50, 3)), axis=0)
+    lengths = np.linalg.norm(np.diff(xyz, axis=0), axis=1)
+    np.testing.assert_allclose(along(xyz), [0, *np.cumsum(lengths)])
+    assert along(xyz[:1]).tolist() == [0.0]
+    fine = np.column_stack([np.arange(100) / 30, np.zeros(100)])
+    np.testing.assert_allclose(along(fine), fine[:, 0])
+
+
+DRIVE = [*range(20)]
+GAPS: dict[str, tuple[list[int], Any, list[tuple[float, float]]]] = {
+    "faster than a vehicle": ([*DRIVE, *range(50, 70)], np.arange(40) / 10, [(0, 19), (50, 69)]),
+    "longer than steps are": ([*DRIVE, *range(60, 80)], np.r_[:20, 90:110], [(0, 19), (60, 79)]),
+    "as a vehicle drives": ([*DRIVE, *range(30, 50)], np.arange(40), [(0, 49)]),
+    "a place far off": ([*DRIVE, 900, *range(20, 40)], np.arange(41) / 10, [(0, 19), (20, 39)]),
+    "stands at first": ([0] * 9 + [*range(900, 920)], np.arange(29) / 10, [(900, 919)]),
+    "no time": ([*DRIVE, *range(30, 50)], np.zeros(40), [(0, 49)]),
+    "few poses far apart": ([0, 30, 70, 20], np.arange(4), [(0, 20)]),
+}
+
+
+@pytest.mark.parametrize("kind", GAPS)
+def test_poses_are_cut_where_nobody_drove(kind: str, tmp_path: Path) -> None:
+    x, stamps, ends = GAPS[kind]
+    xyz = np.pad(np.array(x)[:, None], [(0, 0), (0, 2)])
+    read = read_all_routes(as_poses(tmp_path / "a.tum", xyz, stamps))
+    assert [(r.positions[0, 0], r.positions[-1, 0]) for r in read.routes] == ends
+    assert [r.route_id for r in read.routes] == ["a", "a-2"][: len(ends)]
+    cut = len(ends) > 1 or ends[0][0] > 0
+    assert any("cut where nobody drove" in note for note in read.notes) == cut
+    stands = kind in ("a place far off", "stands at first")
+    assert any("left out, the vehicle stands" in note for note in read.notes) == stands
+
+
+def test_a_kitti_file_without_stamps_is_cut_too(tmp_path: Path) -> None:
+    path = tmp_path / "a.kitti"
+    x = [*range(20), *range(60, 80)]
+    path.write_text("\n".join(f"1 0 0 {v} 0 1 0 0 0 0 1 0" for v in x))
+    assert [r.arc_length[-1] for r in read_routes(path)] == [19.0, 19.0]
+
+
+def test_a_log_is_cut_at_a_jump(tmp_path: Path) -> None:
+    messages: list[logs.Message] = []
+    for i in range(20):
+        stamp = START + i * SECOND // 10
+        T = pose(x=i if i < 9 else i + 400.0)
+        messages += [logs.odometry_at(stamp, T), logs.cloud_at(stamp)]
+    read = read_all_routes(logs.write(tmp_path / "a.mcap", messages))
+    assert [r.arc_length[-1] for r in read.routes] == [8.0, 10.0]
+    assert "a gap of 401.0 m after (8.0, 0.0)" in read.notes[0]
+
+
+def test_a_drawn_line_has_no_gaps(tmp_path: Path) -> None:
+    drawn = [[x, 0, 0] for x in (*DRIVE, *range(500, 520))]
+    assert read_route(geojson(tmp_path / "a.geojson", line(drawn))).arc_length[-1] == 519.0
+
+
 # --- several routes
 
 
@@ -478,7 +560,7 @@ def test_geojson_reads_back_to_the_bit(tmp_path: Path) -> None:
 
 def test_tum_reads_back_to_the_bit(tmp_path: Path) -> None:
     stamps = START + np.arange(5) * SECOND // 3
-    T = np.array([pose(x=3.7e5 + i / 3, y=3.95e6, z=0.1, yaw=0.2 * i) for i in range(5)])
+    T = np.array([pose(x=3.7e5 + 2 * i / 3, y=3.95e6, z=0.1, yaw=0.2 * i) for i in range(5)])
     path = tmp_path / "a.tum"
     write_tum(path, Trajectory(stamps, T))
     assert read_route(path).positions.tobytes() == T[:, :3, 3].tobytes()

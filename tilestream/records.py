@@ -64,7 +64,7 @@ class Route:
     crs: str | None = None
     """Coordinate reference system, where the file or the user names it."""
     dropped: int = 0
-    """Points of the file that were left out as they repeat the one before."""
+    """Points of the file that were left out: less than 0.5 m from the one before that was not."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

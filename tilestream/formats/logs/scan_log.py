@@ -16,7 +16,7 @@ from tilestream.formats.base import SourceInfo
 from tilestream.formats.logs.base import RecordedScan, Recording
 from tilestream.formats.logs.drivers import returned, time_offsets
 from tilestream.formats.logs.poses import PoseStatus, interpolate
-from tilestream.kernels.fixed_order import norms
+from tilestream.formats.motion import along
 from tilestream.records import Float64, Int64, Scan
 
 _BYTES_PER_POINT = 80
@@ -78,7 +78,7 @@ class ScanLog(Recording):
         """What is in the log; of the scans, those given by index (default: all)."""
         used = np.arange(len(self)) if indices is None else indices
         posed = used[self.posed[used]]
-        path_m = norms(np.diff(self.T_map_lidar[posed, :3, 3], axis=0)).sum()
+        path_m = along(self.T_map_lidar[posed, :3, 3])[-1] if len(posed) else 0.0
         stamps = self.stamps_ns[used]
         duration_s = (stamps[-1] - stamps[0]) / 1e9 if len(stamps) else 0.0
         largest_scan = int(self.point_counts[used].max(initial=0))

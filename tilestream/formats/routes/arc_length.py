@@ -5,11 +5,10 @@ import math
 import numpy as np
 
 from tilestream.errors import CorruptSourceError, PoseError, UsageError
+from tilestream.formats.motion import vertices
 from tilestream.kernels.fixed_order import norms
 from tilestream.records import Float64, Route
 
-REPEATED_M = 0.01
-"""A point closer than this to the last one kept repeats it (a vehicle that stands) [m]."""
 TANGENT_M = 0.5
 """The heading at a point is the direction of the chord from this far before to this far after."""
 STEEPEST = 0.5
@@ -26,7 +25,7 @@ def route_of(
     max_jump: float = 1000.0,
     where: str = "route",
 ) -> Route:
-    """A route through some points.
+    """The route through the vertices of a path (`motion.vertices`).
 
     Args:
         route_id: its name.
@@ -48,7 +47,7 @@ def route_of(
             raise CorruptSourceError(f"{where}: point {index} has no z, others have: all or none")
         raise CorruptSourceError(f"{where}: point {index} is not finite: {positions[index]}")
     known = positions[:, :2] if flat else positions
-    kept = _distinct(known)
+    kept = vertices(known)
     if len(kept) < 2:
         raise CorruptSourceError(
             f"{where}: {len(kept)} different points of {len(positions)}; a route needs at least 2"
@@ -103,17 +102,6 @@ def require_length(route: Route, spacing: float) -> None:
             f"spacing = {spacing}: must be above 0 and at most the length of route "
             f"{route.route_id}, {length:.2f} m"
         )
-
-
-def _distinct(points: Float64) -> list[int]:
-    """Indices of the points that do not repeat the last one kept."""
-    kept: list[int] = []
-    last: list[float] | None = None
-    for index, point in enumerate(points.tolist()):
-        if last is None or math.dist(point, last) >= REPEATED_M:
-            kept.append(index)
-            last = point
-    return kept
 
 
 def _check_slope(where: str, positions: Float64, arc_length: Float64) -> None:

@@ -21,6 +21,11 @@ class Path3:
     """(n, 3) points, in the file's unit; z is NaN where there is none."""
     crs: str | None = None
     """Coordinate reference system, where the file names it."""
+    recorded: bool = False
+    """Whether it was recorded pose by pose: points lie close together, also where the vehicle
+    stands."""
+    stamps_s: Float64 | None = None
+    """(n,) time of each point [s], where it was recorded."""
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,11 @@ def read_poses(path: str) -> list[Path3]:
         rows.append([number(path, f"line {row}", word) for word in words])
     if not rows:
         raise CorruptSourceError(f"{path}: is empty; poses need rows of 8 or 12 numbers")
-    columns = [1, 2, 3] if len(rows[0]) == 8 else [3, 7, 11]
-    return [Path3(Path(path).stem, np.array(rows)[:, columns])]
+    numbers = np.array(rows)
+    if len(rows[0]) == 8:
+        positions, stamps = numbers[:, 1:4], numbers[:, 0]
+        return [Path3(Path(path).stem, positions, recorded=True, stamps_s=stamps)]
+    return [Path3(Path(path).stem, numbers[:, [3, 7, 11]], recorded=True)]
 
 
 def read_geojson(path: str) -> Sequence[Path3 | Lost]:

@@ -1,6 +1,7 @@
 """Reading routes from any file that draws a path; the format is told by the ending."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from tilestream.formats.routes.csv_file import read_csv
 from tilestream.formats.routes.degrees import metric
 from tilestream.formats.routes.files import read_geojson, read_poses
 from tilestream.formats.routes.lanelet2 import read_lanelet2
+from tilestream.formats.routes.pieces import pieces
 from tilestream.formats.routes.routes_read import RoutesRead, named
 from tilestream.records import Route
 
@@ -56,9 +58,12 @@ def read_all_routes(
       other without a fork; in `local_x`, `local_y` where every node has them, else degrees;
     * a log (`.mcap`): its poses, see `logs.open_log`.
 
-    Points that repeat the last one within 1 cm are dropped and counted. A path that turns back is
-    kept, the heading follows it. The order of a file's routes is the file's. Where several have one
-    name, the second is called `name-2`, and so on, which is noted.
+    A route leads through vertices 0.5 m apart or farther (`motion.vertices`), so that a vehicle
+    that stands while its poses shake goes nowhere; other points are dropped and counted. A path
+    that turns back is kept, the heading follows it. Poses are cut into several routes where there
+    is a gap that nobody drove (`pieces.pieces`), which is noted. The order of a file's routes is
+    the file's. Where several have one name, the second is called `name-2`, and so on, which is
+    noted.
 
     Coordinates in degrees (how they are told: `degrees.metric`) are refused unless `project_to`
     says where to.
@@ -90,7 +95,7 @@ def read_all_routes(
             drawn = _drawn(name, pose_topic, points_topic)
             paths = [part for part in drawn if isinstance(part, Path3)]
             crs = crs or next((part.crs for part in paths), None)
-            by_hand = READERS.get(Path(name).suffix.lower(), read_poses) is not read_poses
+            by_hand = not any(part.recorded for part in paths)
             positions = [part.positions for part in paths]
             points = metric(name, positions, crs, project_to, by_hand) if paths else []
     except (SourceNotFoundError, UnknownFormatError, CrsError):
@@ -98,22 +103,28 @@ def read_all_routes(
     except SourceError as error:
         return RoutesRead(lost=(Lost(Path(name).stem, error),))
     lost = [part for part in drawn if isinstance(part, Lost)]
-    found = []
-    for part, xyz in zip(paths, points, strict=True):
-        try:
-            found.append(
-                route_of(
-                    part.route_id,
-                    xyz + np.array([0.0, 0.0, lift]),
-                    crs=project_to or crs,
-                    max_jump=max_jump,
-                    where=f"{name}: route {part.route_id}",
+    found: list[Route] = []
+    notes: list[str] = []
+    for drawn_path, xyz in zip(paths, points, strict=True):
+        parts, told = pieces(replace(drawn_path, positions=xyz + np.array([0.0, 0.0, lift])))
+        notes += told
+        for part in parts:
+            where = f"{name}: route {part.route_id}"
+            try:
+                found.append(
+                    route_of(
+                        part.route_id,
+                        part.positions,
+                        crs=project_to or crs,
+                        max_jump=max_jump,
+                        where=where,
+                    )
                 )
-            )
-        except SourceError as error:
-            lost.append(Lost(part.route_id, error))
-    routes, notes = named(found)
-    return RoutesRead(routes, tuple(lost), tuple(f"{name}: {note}" for note in notes))
+            except SourceError as error:
+                lost.append(Lost(part.route_id, error))
+    routes, renamed = named(found)
+    told_of = tuple(f"{name}: {note}" for note in (*notes, *renamed))
+    return RoutesRead(routes, tuple(lost), told_of)
 
 
 def read_routes(
@@ -189,7 +200,14 @@ def _drawn(path: str, pose_topic: str | None, points_topic: str | None) -> Seque
     ending = Path(path).suffix.lower()
     if is_log(path):
         poses = open_log(path, points_topic=points_topic, pose_topic=pose_topic).trajectory
-        return [Path3(Path(path).stem, poses.T_map_lidar[:, :3, 3].copy())]
+        return [
+            Path3(
+                Path(path).stem,
+                poses.T_map_lidar[:, :3, 3].copy(),
+                recorded=True,
+                stamps_s=(poses.stamps_ns - poses.stamps_ns[0]) / 1e9,
+            )
+        ]
     if not Path(path).is_file():
         raise SourceNotFoundError(f"{path}: no such file; check the path")
     if ending not in READERS:

@@ -11,8 +11,8 @@ import pandas as pd
 
 from tilestream.errors import PartialError, TileNotReadyError, UsageError
 from tilestream.formats.logs import ScanLog, ScanSelection
+from tilestream.formats.motion import along
 from tilestream.grid import Box, TileKey, whole_mm
-from tilestream.kernels.fixed_order import norms
 from tilestream.label import start_poses
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.engine.outputs import Parquet
@@ -163,7 +163,8 @@ def _absolute(reading: Reading) -> Reading:
 
 
 def choose_samples(log: ScanLog, scans: ScanSelection, spacing: float) -> tuple[Sample, ...]:
-    """One scan per `spacing` metres of the drive: the one nearest to each multiple of it.
+    """One scan per `spacing` metres of the drive (`motion.along`): the one nearest to each multiple
+    of it.
 
     Raises:
         UsageError: `spacing` is not positive, or no scan with a pose is selected.
@@ -174,8 +175,7 @@ def choose_samples(log: ScanLog, scans: ScanSelection, spacing: float) -> tuple[
     chosen = chosen[log.posed[chosen]]
     if not len(chosen):
         raise UsageError(f"{log.path}: no scan with a pose is selected; {len(log)} scans are there")
-    steps = norms(np.diff(log.T_map_lidar[chosen, :3, 3], axis=0))
-    arc = np.concatenate([[0.0], np.cumsum(steps)])
+    arc = along(log.T_map_lidar[chosen, :3, 3])
     places = np.arange(0.0, arc[-1] + 0.5 * spacing, spacing)
     after = np.clip(np.searchsorted(arc, places), 1, max(1, len(arc) - 1))
     nearer = places - arc[after - 1] <= arc[np.minimum(after, len(arc) - 1)] - places
