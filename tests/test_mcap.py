@@ -10,9 +10,11 @@ from logs import SECOND, START, pose
 from mcap.writer import CompressionType, IndexType
 from scipy.spatial.transform import Rotation
 
-from tilestream.errors import SourceError
+from tilestream.errors import SourceError, UsageError
 from tilestream.formats.drive import open_drive
 from tilestream.formats.logs import ScanSelection, open_log
+from tilestream.formats.logs.deskew import deskew
+from tilestream.formats.logs.drivers import time_offsets
 from tilestream.formats.logs.mcap_file import McapFile
 from tilestream.formats.logs.poses import PoseStatus
 from tilestream.records import Scan
@@ -201,6 +203,15 @@ def test_an_organised_cloud_with_padded_rows(tmp_path: Path) -> None:
     np.testing.assert_array_equal(scan.points, points)
 
 
+@pytest.mark.parametrize("row_step", [0, 12, 100])
+def test_rows_that_lie_side_by_side_are_read_whatever_the_row_step(
+    row_step: int, tmp_path: Path
+) -> None:
+    points = logs.street_points(np.random.default_rng(0), 12)
+    scan = one_cloud(tmp_path / "a.mcap", logs.xyz_rows(points).reshape(3, 4), row_step=row_step)
+    np.testing.assert_array_equal(scan.points, points)
+
+
 TIMES = np.array([0.0, 0.01, 0.05, 0.0999])
 
 
@@ -209,6 +220,11 @@ TIMES = np.array([0.0, 0.01, 0.05, 0.0999])
     [
         ("time", TIMES.astype("<f4")),
         ("time", (TIMES - 0.1).astype("<f4")),
+        ("time", (TIMES * 1e3).astype("<f4")),
+        ("time", (TIMES * 1e6).astype("<f4")),
+        ("time", ((TIMES - 0.1) * 1e6).astype("<f8")),
+        ("time", (TIMES * 1e9).astype("<f4")),
+        ("t", (TIMES * 1e6).astype("<u4")),
         ("t", (TIMES * 1e9).astype("<u4")),
         ("offset_time", (TIMES * 1e9).astype("<u4")),
         ("time_stamp", (TIMES * 1e9).astype("<u4")),
@@ -234,6 +250,57 @@ def test_times_that_make_no_sense_are_no_times(values: np.ndarray, tmp_path: Pat
     points = logs.street_points(np.random.default_rng(0), 4)
     scan = one_cloud(tmp_path / "a.mcap", logs.xyz_rows(points, timestamp=values))
     assert scan.time_offset is None
+
+
+@pytest.mark.parametrize("ticks", [10**3, 10**6, 10**9])
+@pytest.mark.parametrize("since", [0, START])
+def test_times_as_long_integers_keep_their_ticks(ticks: int, since: int) -> None:
+    values = np.array([0, 10, 50, 100]) * ticks // 1000 + since // (10**9 // ticks)
+    offsets = time_offsets(values, START, ticks)
+    assert offsets is not None
+    assert offsets.tolist() == [0.0, 0.01, 0.05, 0.1]
+
+
+@pytest.mark.parametrize("span", [3.0, 3e-3, 3e12])
+def test_times_that_span_no_turn_in_any_unit_are_said_and_not_used(
+    span: float, tmp_path: Path
+) -> None:
+    points = logs.street_points(np.random.default_rng(0), 4)
+    rows = logs.xyz_rows(points, time=np.array([0.0, 0.2, 0.5, 1.0]) * span)
+    scan = one_cloud(tmp_path / "a.mcap", rows)
+    assert scan.time_offset is None
+    log = open_log(tmp_path / "a.mcap")
+    assert f"times of points are not used: they span {span:g} in a scan" in log.notes[-1]
+    with pytest.raises(UsageError, match="no time per point that can be used"):
+        deskew(scan, log.trajectory)
+
+
+def test_few_returns_are_in_the_unit_of_the_other_scans(tmp_path: Path) -> None:
+    kind = "sensor_msgs/msg/PointCloud2"
+    messages: list[logs.Message] = []
+    for i, spans in enumerate([1.0, 1.0, 1e-4, 1.0]):
+        stamp = START + i * SECOND // 10
+        rows = logs.xyz_rows(logs.STREET[:4], t=(TIMES * spans * 1e9).astype("<u4"))
+        cloud = (stamp, "/points", kind, logs.cloud(stamp, rows))
+        messages += [logs.odometry_at(stamp, pose(x=i)), cloud]
+    log = open_log(logs.write(tmp_path / "a.mcap", messages))
+    assert log.time_ticks == 10**9
+    offsets = [scan.time_offset for scan in log.scans()]
+    assert offsets[2] is not None
+    np.testing.assert_allclose(offsets[2], TIMES * 1e-4, atol=1e-9)
+
+
+def test_no_scan_has_a_pose_over_a_jump(tmp_path: Path) -> None:
+    messages: list[logs.Message] = []
+    for i, x in enumerate([0.0, 0.0, 900.0, 901.0]):
+        stamp = START + i * SECOND // 10
+        messages += [logs.odometry_at(stamp, pose(x=x)), logs.cloud_at(stamp + SECOND // 20)]
+    log = open_log(logs.write(tmp_path / "a.mcap", messages))
+    posed, after, jump = PoseStatus.POSED, PoseStatus.AFTER, PoseStatus.JUMP
+    assert log.pose_status.tolist() == [posed, jump, posed, after]
+    assert log.T_map_lidar[[0, 2], 0, 3].tolist() == [0.0, 900.5]
+    assert "1 of 4 scans skipped: where poses jump faster than 60 m/s" in log.notes
+    assert "poses jump 1 times faster than 60 m/s, first by 900.0 m" in log.notes[-1]
 
 
 # --- poses of every kind

@@ -271,7 +271,7 @@ def fields(*kinds: int, names: str = "xyz") -> list[dict[str, object]]:
         ({"point_step": 8}, "field 'z' lies outside of its point"),
         ({"height": 3}, "data has 96 bytes.*3 x 4 points of 12 bytes need 144"),
         ({"width": 2**31, "height": 1}, "data has 96 bytes"),
-        ({"row_step": 40}, "row_step is 40"),
+        ({"row_step": 40, "data": bytes(100)}, "row_step is 40"),
         ({"data": b""}, "data has 0 bytes"),
     ],
 )

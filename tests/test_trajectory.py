@@ -19,6 +19,7 @@ from tilestream.formats.logs.poses import (
     compose,
     interpolate,
     inverse,
+    jumps,
     path_between,
     transform,
 )
@@ -40,6 +41,7 @@ def wandering(count: int, seed: int = 0) -> Trajectory:
 
 def test_between_poses_linear_and_slerp() -> None:
     poses = wandering(20)
+    poses.T_map_lidar[:, :3, 3] *= 0.01  # slow enough
     rng = np.random.default_rng(1)
     times = rng.integers(poses.stamps_ns[0], poses.stamps_ns[-1], 200)
     T, status = interpolate(poses, times, 1e9)
@@ -73,6 +75,20 @@ def test_never_beyond_the_poses_nor_over_a_gap() -> None:
     assert status.tolist() == [before, posed, posed, posed, gap, posed, after]
     assert np.isfinite(T[status == posed]).all()
     assert np.isnan(T[status != posed]).all()
+
+
+def test_never_over_a_jump_that_no_vehicle_drives() -> None:
+    stamps = START + np.array([0, 1, 2, 3, 4]) * SECOND // 10
+    x = [0.0, 0.0, 900.0, 905.9, 912.0]  # 9000, 59 and 61 m/s
+    poses = Trajectory(stamps, np.array([pose(x=at) for at in x]))
+    assert jumps(poses).tolist() == [False, True, False, True]
+    times = START + (np.array([0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.35, 0.4]) * SECOND).astype(np.int64)
+    T, status = interpolate(poses, times, 1.0)
+    posed, jump = PoseStatus.POSED, PoseStatus.JUMP
+    assert status.tolist() == [posed, posed, posed, jump, posed, posed, jump, posed]
+    assert np.isnan(T[status == jump]).all()
+    shaking = Trajectory(START + np.arange(5), np.array([pose(x=0.4 * (i % 2)) for i in range(5)]))
+    assert not jumps(shaking).any()
 
 
 def test_one_pose_and_none() -> None:

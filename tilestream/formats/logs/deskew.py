@@ -53,7 +53,8 @@ def deskew(
     """
     if scan.time_offset is None and sweep is None:
         raise UsageError(
-            f"the scan at {scan.stamp_ns} ns has no time per point; give a sweep to use azimuths"
+            f"the scan at {scan.stamp_ns} ns has no time per point that can be used (the notes of "
+            "its log may say why); give a sweep to use azimuths"
         )
     if not len(scan.points):
         return scan

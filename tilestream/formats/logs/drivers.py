@@ -15,8 +15,11 @@ from tilestream.records import Float64
 INTENSITY_FIELDS = ("intensity",)
 RING_FIELDS = ("ring", "channel")
 TIME_FIELDS = ("time", "t", "timestamp", "offset_time", "time_stamp")
-LONGEST_SCAN_S = 2.0
-"""The time of a point is at most this far from the stamp of its scan [s]."""
+TURN_S = (0.005, 2.0)
+"""How long a turn of a lidar takes, at least and at most [s]: less apart than two units of time, so
+that the span of a turn fits in one of them."""
+TICKS = (1, 10**3, 10**6, 10**9)
+"""How many of a unit are a second: the units in which drivers write times of points."""
 
 
 def recorded_scan(stamp_ns: int, rows: NDArray[np.void]) -> RecordedScan:
@@ -53,23 +56,36 @@ def returned(points: Float64) -> NDArray[np.bool_]:
     return keep
 
 
-def time_offsets(values: NDArray[np.generic], stamp_ns: int) -> Float64 | None:
+def ticks_of(span: float) -> int | None:
+    """How many ticks are a second, of a clock that counted `span` of them in a turn of a lidar;
+    None where that is no turn in any unit.
+    """
+    return next((t for t in TICKS if TURN_S[0] <= span / t <= TURN_S[1]), None)
+
+
+def time_offsets(values: NDArray[np.generic], stamp_ns: int, ticks: int) -> Float64 | None:
     """Per-point times relative to the header [s], from a field as a driver wrote it.
 
-    The rule: the first reading that puts every point within 2 s of the header stamp. Relative to
-    the stamp: integers in ns (Ouster, Livox, Autoware), floats in s (Velodyne). Then since the
-    epoch: s (Hesai, Robosense), ms, us, ns (Livox).
+    They are relative to the stamp (Ouster, Livox, Velodyne) or since the epoch (Hesai, Robosense):
+    whichever puts every point within 2 s of the stamp.
+
+    Args:
+        values: (n,) the field.
+        stamp_ns: time of the header [ns since the epoch].
+        ticks: how many of the field's unit are a second.
 
     Returns:
         (n,) seconds; None where all are 0 (a driver that does not fill the field), some are not
-        finite, or no reading fits (another clock or unit).
+        finite, or neither fits (another clock).
     """
     if not len(values) or not values.any() or not np.isfinite(values).all():
         return None
-    integers = np.issubdtype(values.dtype, np.integer)
-    since_stamp = values.astype(np.float64) / (1e9 if integers else 1.0)
-    readings = [since_stamp]
-    readings += [values.astype(np.float64) / unit - stamp_ns / 1e9 for unit in (1.0, 1e3, 1e6)]
-    readings += [(values.astype(np.int64) - stamp_ns) / 1e9] if integers else []
-    readings += [values.astype(np.float64) / 1e9 - stamp_ns / 1e9]
-    return next((r for r in readings if np.abs(r).max() < LONGEST_SCAN_S), None)
+    seconds = values.astype(np.float64) / ticks
+    since_epoch = seconds - stamp_ns / 1e9
+    if np.issubdtype(values.dtype, np.integer) and _within(since_epoch):  # to the nanosecond
+        since_epoch = (values.astype(np.int64) * (10**9 // ticks) - stamp_ns) / 1e9
+    return next((times for times in (seconds, since_epoch) if _within(times)), None)
+
+
+def _within(times: Float64) -> bool:
+    return bool(np.abs(times).max() <= TURN_S[1])

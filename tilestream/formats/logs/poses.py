@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from tilestream.kernels.fixed_order import turned
+from tilestream.formats.motion import jumped
+from tilestream.kernels.fixed_order import norms, turned
 from tilestream.records import Float64, Int64, Trajectory
 
 
@@ -23,6 +24,8 @@ class PoseStatus(IntEnum):
     """After the last pose."""
     GAP = 3
     """Between two poses that are too far apart in time."""
+    JUMP = 4
+    """Between two poses farther apart than a vehicle drives in the time between them."""
 
 
 def matrices(numbers: Float64) -> Float64:
@@ -71,7 +74,8 @@ def interpolate(
     poses: Trajectory, stamps_ns: Int64, max_gap_s: float
 ) -> tuple[Float64, NDArray[np.int8]]:
     """The pose at some times: position linear, rotation at constant rate between two poses (slerp),
-    the recorded pose itself where the times agree, and never beyond the first or last pose.
+    the recorded pose itself where the times agree, never beyond the first or last pose, and never
+    over a jump (`motion.jumped`).
 
     Args:
         poses: k >= 0 poses.
@@ -98,7 +102,15 @@ def interpolate(
     status[at_pose | between] = PoseStatus.POSED
     gaps = np.flatnonzero(between)[span > max_gap_s * 1e9]
     T[gaps], status[gaps] = np.nan, PoseStatus.GAP
+    over = np.flatnonzero(between)[jumps(poses)[b - 1]]
+    T[over], status[over] = np.nan, PoseStatus.JUMP
     return T, status
+
+
+def jumps(poses: Trajectory) -> NDArray[np.bool_]:
+    """(k - 1,) whether no vehicle drives from each pose to the next in the time between them."""
+    steps = norms(np.diff(poses.T_map_lidar[:, :3, 3], axis=0))
+    return jumped(steps, np.diff(poses.stamps_ns) / 1e9)
 
 
 def _blend(T_a: Float64, T_b: Float64, share: Float64) -> Float64:

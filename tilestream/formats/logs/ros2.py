@@ -153,7 +153,7 @@ def read_cloud(data: memoryview) -> Cloud:
     except struct.error as error:
         raise CorruptSourceError(f"a {POINT_CLOUD} that is too short ({error})") from error
     dtype = _point_type(fields, order, point_step)
-    if height <= 1:
+    if height <= 1 or len(packed) == height * width * point_step:  # whatever row_step says
         row_step = width * point_step
     elif row_step < width * point_step:
         raise CorruptSourceError(

@@ -1,7 +1,8 @@
 """The scans of a log with the pose of the lidar at each, whatever the format."""
 
+import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,13 +15,15 @@ from tilestream.errors import (
 )
 from tilestream.formats.base import SourceInfo
 from tilestream.formats.logs.base import RecordedScan, Recording
-from tilestream.formats.logs.drivers import returned, time_offsets
-from tilestream.formats.logs.poses import PoseStatus, interpolate
-from tilestream.formats.motion import along
+from tilestream.formats.logs.drivers import TIME_FIELDS, TURN_S, returned, ticks_of, time_offsets
+from tilestream.formats.logs.poses import PoseStatus, interpolate, jumps
+from tilestream.formats.motion import FASTEST, along
 from tilestream.records import Float64, Int64, Scan
 
 _BYTES_PER_POINT = 80
 """What the columns of a scan that is read take [bytes per point]."""
+LOOKED_AT = 5
+"""So many scans tell the unit of the points' times."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -33,6 +36,8 @@ class ScanLog(Recording):
     """(k, 4, 4) pose of the lidar at each scan's stamp; NaN where it has none."""
     pose_status: NDArray[np.int8]
     """(k,) `PoseStatus`: POSED, or why the scan is skipped."""
+    time_ticks: int | None = None
+    """How many of the unit of the points' times are a second; None where they cannot be used."""
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -58,7 +63,7 @@ class ScanLog(Recording):
         """As `scans`, for any scans by index, e.g. of a `ScanSelection`."""
         wanted = [int(i) for i in indices if self.pose_status[i] == PoseStatus.POSED]
         for index, recorded in zip(wanted, self.recorded_at(wanted), strict=True):
-            yield _scan(recorded, self.T_map_lidar[index])
+            yield _scan(recorded, self.T_map_lidar[index], self.time_ticks)
 
     def recorded_at(self, indices: list[int]) -> Iterator[RecordedScan]:
         """Some scans as they were recorded, posed or not; errors as for `scans`."""
@@ -102,16 +107,55 @@ class ScanLog(Recording):
 
 
 def with_poses(found: Recording, max_gap_s: float) -> ScanLog:
-    """The scans of a log with their poses, interpolated over at most `max_gap_s` [s]. Scans without
-    a pose are noted.
+    """The scans of a log with their poses, interpolated over at most `max_gap_s` [s], and the unit
+    of the points' times. Scans without a pose are noted, so are jumps, and times of no use.
 
     Raises:
         PoseError: no scan has a pose.
     """
     T_map_lidar, status = interpolate(found.trajectory, found.stamps_ns, max_gap_s)
-    notes = (*found.notes, *_skipped(found, status, max_gap_s))
+    notes = (*found.notes, *_skipped(found, status, max_gap_s), *_jumps(found))
     known = {**vars(found), "notes": notes}
-    return ScanLog(**known, T_map_lidar=T_map_lidar, pose_status=status)
+    return _with_times(ScanLog(**known, T_map_lidar=T_map_lidar, pose_status=status))
+
+
+def _with_times(log: ScanLog) -> ScanLog:
+    """With the unit of the points' times: the one in which the middle of the spans of a few scans
+    is a turn of a lidar.
+    """
+    if not any(name in TIME_FIELDS for name, _ in log.fields):
+        return log
+    few = np.unique(np.linspace(0, len(log) - 1, LOOKED_AT).round().astype(int))
+    spans = [_span(recorded) for recorded in log.recorded_at(few.tolist())]
+    span = float(np.median([span for span in spans if span > 0] or [0.0]))
+    ticks = ticks_of(span)
+    if ticks is None and span > 0:
+        note = (
+            f"times of points are not used: they span {span:g} in a scan, which in no unit from "
+            f"seconds to nanoseconds is a turn of a lidar ({TURN_S[0]:g} to {TURN_S[1]:g} s)"
+        )
+        return replace(log, notes=(*log.notes, note))
+    return replace(log, time_ticks=ticks)
+
+
+def _span(recorded: RecordedScan) -> float:
+    """From the first to the last time of a scan's returns, in the driver's unit."""
+    if recorded.time is None:
+        return 0.0
+    times = recorded.time[returned(recorded.points)]
+    times = times[np.isfinite(times)]
+    return float(np.ptp(times)) if len(times) else 0.0
+
+
+def _jumps(found: Recording) -> list[str]:
+    """A note on poses that jump."""
+    at = np.flatnonzero(jumps(found.trajectory))
+    if not len(at):
+        return []
+    a, b = found.trajectory.T_map_lidar[[at[0], at[0] + 1], :3, 3]
+    seconds = found.trajectory.stamps_ns[at[0]] / 1e9
+    first = f"first by {math.dist(a, b):.1f} m after {seconds:.3f} s"
+    return [f"poses jump {len(at)} times faster than {FASTEST:g} m/s, {first}"]
 
 
 def _skipped(found: Recording, status: NDArray[np.int8], max_gap_s: float) -> list[str]:
@@ -120,19 +164,21 @@ def _skipped(found: Recording, status: NDArray[np.int8], max_gap_s: float) -> li
         PoseStatus.BEFORE: "before the first pose",
         PoseStatus.AFTER: "after the last pose",
         PoseStatus.GAP: f"where poses are more than {max_gap_s:g} s apart",
+        PoseStatus.JUMP: f"where poses jump faster than {FASTEST:g} m/s",
     }
     if not (status == PoseStatus.POSED).any():
         scans, poses = found.stamps_ns / 1e9, found.trajectory.stamps_ns / 1e9
         raise PoseError(
             f"{found.path}: none of the {len(scans)} scans has a pose: scans are from "
             f"{scans[0]:.3f} to {scans[-1]:.3f} s, poses from {poses[0]:.3f} to {poses[-1]:.3f} s, "
-            f"and none is interpolated over more than {max_gap_s:g} s; are these the same clock?"
+            f"and none is interpolated over more than {max_gap_s:g} s or a jump faster than "
+            f"{FASTEST:g} m/s; are these the same clock?"
         )
     counts = {why: int((status == code).sum()) for code, why in reasons.items()}
     return [f"{n} of {len(status)} scans skipped: {why}" for why, n in counts.items() if n]
 
 
-def _scan(recorded: RecordedScan, T_map_lidar: Float64) -> Scan:
+def _scan(recorded: RecordedScan, T_map_lidar: Float64, ticks: int | None) -> Scan:
     """The returns of a recorded scan, in the types that every scan has."""
     keep = kept(returned(recorded.points))
     points, time = recorded.points[keep], recorded.time
@@ -145,7 +191,9 @@ def _scan(recorded: RecordedScan, T_map_lidar: Float64) -> Scan:
         ),
         ring=None if recorded.ring is None else recorded.ring[keep].astype(np.int32),
         time_offset=(
-            None if time is None else time_offsets(_native(time[keep]), recorded.stamp_ns)
+            None
+            if time is None or ticks is None
+            else time_offsets(_native(time[keep]), recorded.stamp_ns, ticks)
         ),
         dropped=len(recorded.points) - len(points),
     )
