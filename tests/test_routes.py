@@ -432,6 +432,11 @@ GAPS: dict[str, tuple[list[int], Any, list[tuple[float, float]]]] = {
     "as a vehicle drives": ([*DRIVE, *range(30, 50)], np.arange(40), [(0, 49)]),
     "a place far off": ([*DRIVE, 900, *range(20, 40)], np.arange(41) / 10, [(0, 19), (20, 39)]),
     "stands at first": ([0] * 9 + [*range(900, 920)], np.arange(29) / 10, [(900, 919)]),
+    "slow for long, then fast": (
+        [*range(99), *range(99, 900, 30)],
+        np.arange(126),
+        [(0, 879)],
+    ),
     "no time": ([*DRIVE, *range(30, 50)], np.zeros(40), [(0, 49)]),
     "few poses far apart": ([0, 30, 70, 20], np.arange(4), [(0, 20)]),
 }

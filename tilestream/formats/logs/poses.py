@@ -102,7 +102,8 @@ def interpolate(
     status[at_pose | between] = PoseStatus.POSED
     gaps = np.flatnonzero(between)[span > max_gap_s * 1e9]
     T[gaps], status[gaps] = np.nan, PoseStatus.GAP
-    over = np.flatnonzero(between)[jumps(poses)[b - 1]]
+    steps = norms(poses.T_map_lidar[b, :3, 3] - poses.T_map_lidar[b - 1, :3, 3])
+    over = np.flatnonzero(between)[jumped(steps, span / 1e9)]
     T[over], status[over] = np.nan, PoseStatus.JUMP
     return T, status
 

@@ -9,15 +9,18 @@ from tilestream.formats.routes.base import Path3
 from tilestream.kernels.fixed_order import norms
 
 MANY = 20.0
-"""A step so many times as long as the usual one is a gap in what was recorded."""
+"""A step so many times as long as the usual one is a gap in what was recorded, ..."""
+PAUSE = 5.0
+"""... if it also took so many times as long: without a pause it is the vehicle that is faster."""
 
 
 def pieces(path: Path3) -> tuple[list[Path3], list[str]]:
     """The parts of a recorded path between its gaps, and notes on where it was cut.
 
     A gap is a step that no vehicle drives between its stamps (`motion.jumped`), or that is more
-    than 20 times as long as the usual step: the median of those between vertices. A part in which
-    the vehicle stands is left out, if there are others. A path that was drawn has no gaps.
+    than 20 times as long as the usual step (the median of those between vertices) after more than 5
+    times the usual time; where there are no stamps, the length decides. A part in which the vehicle
+    stands is left out, if there are others. A path that was drawn has no gaps.
 
     Args:
         path: a path in metres.
@@ -30,7 +33,9 @@ def pieces(path: Path3) -> tuple[list[Path3], list[str]]:
     usual = norms(np.diff(known[vertices(known)], axis=0))
     gaps = steps > MANY * np.median(usual) if len(usual) else np.zeros(len(steps), dtype=bool)
     if path.stamps_s is not None:
-        gaps |= jumped(steps, np.diff(path.stamps_s))
+        seconds = np.diff(path.stamps_s)
+        gaps &= seconds > PAUSE * np.median(seconds)
+        gaps |= jumped(steps, seconds)
     cuts = np.flatnonzero(gaps) + 1
     if not len(cuts):
         return [path], []
