@@ -39,6 +39,7 @@ LONG = (
     "model_file",
     "report_page",
     "readme",
+    "cases_route",
     "store",
     "factors_route",
     "localize_drive",

@@ -71,6 +71,19 @@ def test_factors_of_the_good_ones_and_the_bad_ones_listed(
     assert why in told.err
 
 
+def test_what_else_failed_is_listed_with_the_bad_ones(
+    cases: Path, street: str, tmp_path: Path, capsys: Told
+) -> None:
+    off = tmp_path / "off.csv"
+    off.write_text("x,y\n5,0\n500,0\n")
+    routes = ["--route", str(cases / "route" / "one_line_of_1_mm.geojson"), "--route", str(off)]
+    assert run(["factors", street, *routes, "--out", str(tmp_path / "out")]) == 1
+    told = capsys.readouterr().err
+    assert "not every sample point has factors" in told
+    assert "route tiny: " in told
+    assert "sample points" in told
+
+
 def test_factors_along_routes_of_one_name(
     cases: Path, street: str, tmp_path: Path, capsys: Told
 ) -> None:

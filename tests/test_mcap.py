@@ -300,7 +300,7 @@ def test_no_scan_has_a_pose_over_a_jump(tmp_path: Path) -> None:
     assert log.pose_status.tolist() == [posed, jump, posed, after]
     assert log.T_map_lidar[[0, 2], 0, 3].tolist() == [0.0, 900.5]
     assert "1 of 4 scans skipped: where poses jump faster than 60 m/s" in log.notes
-    assert "poses jump 1 times faster than 60 m/s, first by 900.0 m" in log.notes[-1]
+    assert "poses jump faster than 60 m/s at 1 of 3 steps, first by 900.0 m" in log.notes[-1]
 
 
 # --- poses of every kind

@@ -155,7 +155,8 @@ def _jumps(found: Recording) -> list[str]:
     a, b = found.trajectory.T_map_lidar[[at[0], at[0] + 1], :3, 3]
     seconds = found.trajectory.stamps_ns[at[0]] / 1e9
     first = f"first by {math.dist(a, b):.1f} m after {seconds:.3f} s"
-    return [f"poses jump {len(at)} times faster than {FASTEST:g} m/s, {first}"]
+    steps = len(found.trajectory.stamps_ns) - 1
+    return [f"poses jump faster than {FASTEST:g} m/s at {len(at)} of {steps} steps, {first}"]
 
 
 def _skipped(found: Recording, status: NDArray[np.int8], max_gap_s: float) -> list[str]:
