@@ -217,9 +217,19 @@ def compare(
         )
         registration, height = labels.registration, places.sensor_height
         if dry_run:
-            how = (places.spacing, registration, height, VirtualSettings(), places.memory)
-            of_map = (opened, routes, folder, choices)
-            out.print(plan_table(comparing.plan_compare(*of_map, *how, which_map.partial)))
+            plan = comparing.plan_compare(
+                opened,
+                routes,
+                folder,
+                choices,
+                places.spacing,
+                registration,
+                height,
+                VirtualSettings(),
+                places.memory,
+                which_map.partial,
+            )
+            out.print(plan_table(plan))
             return
         with cluster.client(places.memory) as client, progress() as watch:
             found = comparing.compare(
