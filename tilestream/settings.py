@@ -277,7 +277,7 @@ class PlaceSettings(Settings):
     """Where a job looks from, and the vehicle that looks."""
 
     project_to: str | None = None
-    """CRS for routes in degrees."""
+    """CRS to project routes to that are in degrees or in another one; not given: the map's."""
     spacing: Positive = 1.0
     """Distance between sample points [m]."""
     sensor: Annotated[str | Sensor | Vehicle, BeforeValidator(named)] = "VLP16"

@@ -14,12 +14,12 @@ from typing import Any
 import pandas as pd
 
 from tilestream.errors import PartialError, UsageError
-from tilestream.factors.rows import in_route_order, samples_by_tile
+from tilestream.factors.rows import in_route_order
 from tilestream.grid import MM_PER_M, whole_mm
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, paths_of
 from tilestream.pipeline.engine.stage import Task
-from tilestream.pipeline.jobs.along_routes import SENSOR_HEIGHT, plan_observe
+from tilestream.pipeline.jobs.along_routes import SENSOR_HEIGHT, plan_observe, samples_along
 from tilestream.pipeline.jobs.inventory import make_tables
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.observe import Observing, observe
@@ -193,7 +193,7 @@ def plan_compare(
     require_sizes(store, sizes_mm)
     map_plan = MapPlan.of_store(store, partial=partial)
     tasks: list[Task] = []
-    samples = samples_by_tile(store.grid, routes, spacing)
+    samples = samples_along(store, routes, spacing)
     for choice in choices:
         observing = Observing(
             choice.sensor, choice.seeing(seeing), registration, choice.cell_size, sensor_height

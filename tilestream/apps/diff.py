@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 from scipy.spatial import cKDTree
 
+from tilestream.crs import require_same
 from tilestream.errors import UsageError
 from tilestream.grid import TileKey
 from tilestream.pipeline.jobs.run_folder import map_of, rows_of
@@ -49,6 +50,7 @@ def diff(
     Raises:
         StoreNotFoundError: nothing there.
         UsageError: tiles of different size, which cannot be compared.
+        CrsError: maps in two CRS.
     """
     before, after = map_of(old), map_of(new)
     if before.settings.tile_size != after.settings.tile_size:
@@ -56,6 +58,7 @@ def diff(
             f"{before.url} has tiles of {before.settings.tile_size:g} m and {after.url} of "
             f"{after.settings.tile_size:g} m: compare maps of one tile size"
         )
+    require_same(before.url, before.settings.crs, after.url, after.settings.crs)
     had, has = before.identities(), after.identities()
     both = sorted(set(had) & set(has))
     points, compared = _worse(_estimates(old), _estimates(new), worse)

@@ -35,7 +35,9 @@ def numbers(lists: list[str], option: str) -> list[float]:
 
 
 @contextmanager
-def routes_of(files: list[str], project_to: str | None, spacing: float) -> Iterator[RoutesRead]:
+def routes_of(
+    files: list[str], project_to: str | None, spacing: float, map_crs: str | None
+) -> Iterator[RoutesRead]:
     """The routes of all files that can be used; their notes are printed.
 
     Raises:
@@ -43,7 +45,7 @@ def routes_of(files: list[str], project_to: str | None, spacing: float) -> Itera
         PartialError: when all is done with the good ones, some cannot be used; lists them, with
             what else failed.
     """
-    read = together(read_all_routes(path, project_to=project_to) for path in files)
+    read = together(read_all_routes(path, project_to=project_to, map_crs=map_crs) for path in files)
     read = read.at_least(spacing)
     for note in read.notes:
         say(note, to=err)

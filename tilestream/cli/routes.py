@@ -21,7 +21,6 @@ from tilestream.cli.tables import (
 )
 from tilestream.errors import PartialError
 from tilestream.factors.catalogue import Which
-from tilestream.factors.rows import samples_by_tile
 from tilestream.pipeline.jobs import along_routes
 from tilestream.pipeline.jobs import localize as localize_drive
 from tilestream.pipeline.jobs.run_inputs import reading_of, scans_of
@@ -137,12 +136,12 @@ def factors(
 ) -> None:
     """Compute the factors of the map at every sample point of a route."""
     opened = open_store(store)
-    with routes_of(route, places.project_to, places.spacing) as read:
+    with routes_of(route, places.project_to, places.spacing, opened.settings.crs) as read:
         routes = read.routes
         sensor, height = places.looking_sensor, places.sensor_height
         if dry_run:
             looking = Looking(sensor, places.cell_size, which, height)
-            samples = samples_by_tile(opened.grid, routes, places.spacing)
+            samples = along_routes.samples_along(opened, routes, places.spacing)
             seen = MapPlan.of_store(opened, partial=which_map.partial)
             plan = along_routes.plan_factors(seen, samples, folder, looking, places.memory)
             out.print(plan_table(plan))
@@ -207,7 +206,7 @@ def compare(
     for limit in (report.threshold, cap):
         check_threshold(limit)
     opened = open_store(store)
-    with routes_of(route, places.project_to, places.spacing) as read:
+    with routes_of(route, places.project_to, places.spacing, opened.settings.crs) as read:
         routes = read.routes
         choices = comparing.choices_of(
             [sensor_of(name) for name in sensor],

@@ -1,5 +1,7 @@
 """Sample points: places on a route, raised to where the lidar is (definitions, section 2)."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -34,15 +36,7 @@ def sample_points(
         TileNotReadyError: a tile under the route failed or was skipped.
     """
     points = resample(route, spacing)
-    raised_positions = raised(points.positions, store, sensor_height)
-    return Route(
-        points.route_id,
-        raised_positions,
-        points.arc_length,
-        points.heading,
-        points.crs,
-        points.dropped,
-    )
+    return replace(points, positions=raised(points.positions, store, sensor_height))
 
 
 def raised(positions: ArrayLike, store: TileStore, sensor_height: float = 2.0) -> Float64:

@@ -38,6 +38,7 @@ FORMATS: tuple[Format[PointSource], ...] = (
     ply.FORMAT,
     e57.FORMAT,
     autoware.FORMAT,
+    autoware.UNDIVIDED,
     *DRIVES,
 )
 """What `open_source` reads."""
@@ -99,7 +100,7 @@ def expand_sources(
 
     Args:
         patterns: one or more of a file, a glob (`**` goes through directories) or a directory of a
-            known format; one of Autoware's divided map stands for its PCD files.
+            known format; one of Autoware's maps stands for its PCD files.
 
     Raises:
         SourceNotFoundError: a file does not exist or a glob matches nothing; names it.
@@ -128,6 +129,7 @@ def _expand(pattern: str) -> list[str]:
 
 
 def _files_of(path: str) -> list[str]:
-    if Path(path).is_dir() and format_of(path, FORMATS) is autoware.FORMAT:
+    maps = (autoware.FORMAT, autoware.UNDIVIDED)
+    if Path(path).is_dir() and format_of(path, FORMATS) in maps:
         return list(autoware.open_map_directory(path).files)
     return [path]

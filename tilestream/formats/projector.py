@@ -12,6 +12,8 @@ from tilestream.errors import CorruptSourceError
 
 PROJECTOR = "map_projector_info.yaml"
 METADATA = "pointcloud_map_metadata.yaml"
+CLOUD = "pointcloud_map.pcd"
+"""The one PCD file of a map, or the sub-directory of several."""
 _BANDS = "CDEFGHJKLMNPQRSTUVWX"
 _COLUMNS = ("STUVWXYZ", "ABCDEFGH", "JKLMNPQR")
 """Letters of the 100 km columns from 100 km east on, by zone modulo 3."""
@@ -35,12 +37,12 @@ def read_mapping(path: Path) -> dict[Any, Any]:
 
 
 def crs_beside(path: Path) -> tuple[str | None, tuple[str, ...]]:
-    """CRS and a note for a PCD of Autoware: from its folder, or the one above if that lists it.
+    """CRS and a note for a PCD of Autoware: from its folder, or the one above if it is of its map.
 
     (None, ()) where no `map_projector_info.yaml` belongs to the file.
     """
     folders = [path.parent]
-    if (path.parent.parent / METADATA).is_file():
+    if path.parent.name == CLOUD or (path.parent.parent / METADATA).is_file():
         folders.append(path.parent.parent)
     for folder in folders:
         if (folder / PROJECTOR).is_file():

@@ -36,7 +36,7 @@ class Format(Generic[Opened_co]):
     recognise: Callable[[bytes], bool] | None = None
     """Whether the first bytes of a file are of this format; None: by `magic`."""
     marker: str = ""
-    """The file that every directory of this format has; empty for a format that is a file."""
+    """The file or folder that every directory of this format has; empty for one that is a file."""
     options: tuple[str, ...] = ()
     """Names of the options that `open` takes."""
 
@@ -103,7 +103,7 @@ def format_of_directory(
     path: str, formats: Sequence[Format[Opened_co]]
 ) -> Format[Opened_co] | None:
     """The format whose marker is in this directory; None: no format's is, or it is none."""
-    return next((f for f in formats if f.marker and (Path(path) / f.marker).is_file()), None)
+    return next((f for f in formats if f.marker and (Path(path) / f.marker).exists()), None)
 
 
 def _unknown_ending(

@@ -1,4 +1,6 @@
-"""Autoware's divided map: a directory of PCD files with `pointcloud_map_metadata.yaml`."""
+"""Autoware's maps: a directory with `pointcloud_map.pcd`, a file or a folder of PCD files, which
+`pointcloud_map_metadata.yaml` lists where the map is divided.
+"""
 
 import math
 from collections.abc import Iterator
@@ -12,21 +14,18 @@ from tilestream.errors import CorruptSourceError, SourceNotFoundError
 from tilestream.formats.base import Block, SourceInfo, Span
 from tilestream.formats.points.pcd import open_pcd
 from tilestream.formats.points.rows import RowSource, whole_span
-from tilestream.formats.projector import METADATA, PROJECTOR, read_mapping, read_projector
+from tilestream.formats.projector import CLOUD, METADATA, PROJECTOR, read_mapping, read_projector
 from tilestream.formats.registry import Format
-
-_INSIDE = "pointcloud_map.pcd"
-"""The sub-directory into which Autoware puts the PCD files."""
 
 
 @dataclass(frozen=True)
 class MapDirectory:
-    """A divided map: its PCD files one behind the other, in the order of their names."""
+    """A map: its PCD files one behind the other, in the order of their names."""
 
     path: str
     """The directory, as it was named."""
     files: tuple[str, ...]
-    """The PCD files that the metadata lists, sorted."""
+    """Its PCD files, sorted: those that the metadata lists, where there is one."""
     crs: str | None
     """CRS of x and y, where `map_projector_info.yaml` tells one."""
     notes: tuple[str, ...]
@@ -44,7 +43,7 @@ class MapDirectory:
         """What the headers of all files tell together."""
         return SourceInfo(
             path=self.path,
-            format="autoware divided map",
+            format="autoware divided map" if len(self.files) > 1 else "autoware map",
             size_bytes=sum(part.summary.size_bytes for part in self._parts),
             points=self._starts[-1],
             fields=tuple(
@@ -74,14 +73,16 @@ class MapDirectory:
 
 
 def open_map_directory(path: str) -> MapDirectory:
-    """A divided map; its metadata is read, and every file that it lists is there.
+    """A map; the metadata of a divided one is read, and every file that it lists is there.
 
     Raises:
         CorruptSourceError: the metadata cannot be read, or names a file outside of the directory.
-        SourceNotFoundError: the metadata or files that it lists are missing; names them.
+        SourceNotFoundError: files that it lists are missing, names them; or there are none.
     """
     folder = Path(path)
     metadata = folder / METADATA
+    if not metadata.exists():
+        return _undivided(folder, path)
     content = read_mapping(metadata)
     width, height = (
         _length(content.pop(name, None), name, metadata)
@@ -91,20 +92,31 @@ def open_map_directory(path: str) -> MapDirectory:
         _check_corner(name, corner, metadata)
     files = sorted({_file(folder, name, metadata) for name in content})
     _refuse_missing(files, metadata)
+    return _map_of(folder, path, files, f"{len(files)} parts of {width:g} x {height:g} m")
+
+
+def _undivided(folder: Path, path: str) -> MapDirectory:
+    """A map without metadata: its one PCD file, or all of its folder."""
+    inside = folder / CLOUD
+    files = [inside] if inside.is_file() else sorted(inside.glob("*.pcd"))
+    if not files:
+        raise SourceNotFoundError(f"{inside}: holds no PCD file; copy the map's files there")
+    return _map_of(folder, path, files, f"{len(files)} PCD files, no {METADATA}")
+
+
+def _map_of(folder: Path, path: str, files: list[Path], told: str) -> MapDirectory:
     projector = folder / PROJECTOR
     crs, notes = read_projector(projector) if projector.is_file() else (None, ())
-    return MapDirectory(
-        path=path,
-        files=tuple(map(str, files)),
-        crs=crs,
-        notes=(
-            f"{len(files)} parts of {width:g} x {height:g} m",
-            *notes,
-            *_unlisted(folder, set(files)),
-        ),
-    )
+    notes = (told, *notes, *_unlisted(folder, set(files)))
+    return MapDirectory(path, tuple(map(str, files)), crs, notes)
 
 
+UNDIVIDED = Format(
+    name="Autoware's map",
+    what="its PCD file, with CRS",
+    open=open_map_directory,
+    marker=CLOUD,
+)
 FORMAT = Format(
     name="Autoware's divided map",
     what="its PCD files, with CRS",
@@ -123,7 +135,7 @@ def _file(folder: Path, name: Any, metadata: Path) -> Path:
     """Where a listed file is: in the sub-directory if it is there, else beside the metadata."""
     if not isinstance(name, str) or not name.lower().endswith(".pcd"):
         raise CorruptSourceError(f"{metadata}: entry {name!r} is no name of a PCD file")
-    inside = folder / _INSIDE / name
+    inside = folder / CLOUD / name
     file = inside if inside.is_file() else folder / name
     home = folder.resolve()
     if Path(name).is_absolute() or ".." in Path(name).parts or home not in file.resolve().parents:
@@ -153,7 +165,7 @@ def _refuse_missing(files: list[Path], metadata: Path) -> None:
 
 
 def _unlisted(folder: Path, listed: set[Path]) -> tuple[str, ...]:
-    found = [*folder.glob("*.pcd"), *(folder / _INSIDE).glob("*.pcd")]
+    found = [*folder.glob("*.pcd"), *(folder / CLOUD).glob("*.pcd")]
     names = sorted(file.name for file in found if file.is_file() and file not in listed)
     if not names:
         return ()

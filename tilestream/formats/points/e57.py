@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
-from tilestream.errors import CorruptSourceError, UnknownFormatError
+from tilestream.crs import enter, named
+from tilestream.errors import CorruptSourceError, CrsError, UnknownFormatError
 from tilestream.formats.base import Block, SourceInfo, Span
 from tilestream.formats.points.rows import RowSource, finite_block, whole_span
 from tilestream.formats.registry import Format
@@ -100,6 +101,7 @@ def open_e57(path: str) -> RowSource:
         UnknownFormatError: the extra is not installed.
         CorruptSourceError: the file is cut short or damaged, or a scan has no coordinates that can
             be read, no proper pose, or claims more points than the file holds.
+        CrsError: its CRS is not in metres.
     """
     if libe57 is None:
         raise UnknownFormatError(f"{path}: E57 needs an extra: pip install 'tilestream[e57]'")
@@ -112,7 +114,7 @@ def open_e57(path: str) -> RowSource:
             start = scans[-1].span.stop if scans else 0
             scans.append(_scan(data[i], i, start, path, size_bytes))
         described = _text(root, "coordinateMetadata").strip()
-    crs, notes = _crs(described)
+    crs, notes = _crs(described, path)
     notes += tuple(
         f"scan {i} {scan.name!r}: {scan.span.stop - scan.span.start} points"
         for i, scan in enumerate(scans)
@@ -234,14 +236,25 @@ def _text(node: Any, name: str) -> str:
     return str(node[name].value()) if node.isDefined(name) else ""
 
 
-def _crs(described: str) -> tuple[str | None, tuple[str, ...]]:
+def _crs(described: str, path: str) -> tuple[str | None, tuple[str, ...]]:
+    """The CRS of the file's frame, whose points are in metres by the standard.
+
+    Raises:
+        CrsError: it is in degrees, or in another unit: which of both is meant no one can tell.
+    """
     if not described:
         return None, ()
     try:
-        CRS.from_user_input(described)
+        system = CRS.from_user_input(described)
     except CRSError:
         return None, (f"its coordinateMetadata is no CRS that pyproj reads: {described[:200]!r}",)
-    return described, ()
+    found = enter(system, path)
+    if not found.metric:
+        raise CrsError(
+            f"{path}: E57 holds metres, and its CRS {named(system)} is in {found.xy.name}: write "
+            "it again with a CRS in metres"
+        )
+    return found.crs, found.notes
 
 
 def _reader(

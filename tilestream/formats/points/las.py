@@ -19,12 +19,12 @@ import laspy
 import lazrs
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pyproj import CRS
-from pyproj.exceptions import CRSError
 
-from tilestream.errors import CorruptSourceError, CrsError, UsageError
+from tilestream.crs import Entered, parsed
+from tilestream.errors import CorruptSourceError, UsageError
 from tilestream.files import Files
 from tilestream.formats.base import Block, SourceInfo, Span
+from tilestream.formats.points.las_crs import crs_of
 from tilestream.formats.points.rows import (
     BinaryRows,
     Column,
@@ -36,6 +36,7 @@ from tilestream.formats.points.rows import (
     whole_span,
 )
 from tilestream.formats.registry import Format
+from tilestream.records import Float64
 
 logging.getLogger("laspy").addHandler(logging.NullHandler())  # its errors are raised as ours
 
@@ -127,11 +128,11 @@ class LazRows:
 
 def open_las(path: str) -> RowSource:
     """A LAS or LAZ file; its header and chunk table are read and checked against its size. A
-    coordinate is stored integer x scale + offset, in float64.
+    coordinate is stored integer x scale + offset, in float64, brought to metres.
 
     Raises:
         CorruptSourceError: the file is too short for what its header claims, or damaged.
-        CrsError: it has a CRS that pyproj cannot read.
+        CrsError: its CRS is in degrees, or in units that are no lengths.
     """
     with Path(path).open("rb") as file:
         size_bytes = os.fstat(file.fileno()).st_size
@@ -141,7 +142,8 @@ def open_las(path: str) -> RowSource:
             header = laspy.LasHeader.read_from(file, read_evlrs=True)
             dimensions = list(header.point_format.dimensions)
             dtype = header.point_format.dtype()
-        scaling = _scaling(header, path)
+        crs = crs_of(header, path)
+        scaling = _scaling(header, crs, path)
         plain = BinaryRows(path, points_at, point_bytes, count, _XYZ, scaling)
         rows: BinaryRows | LazRows = plain
         resident = 0
@@ -154,9 +156,9 @@ def open_las(path: str) -> RowSource:
             resident = max(sizes, default=0)
         else:
             plain.check_size(size_bytes)
-    crs, notes = _crs(header, path)
     lowest, highest = (
-        tuple(np.asarray(edge, float).tolist()) for edge in (header.mins, header.maxs)
+        tuple((np.asarray(edge, float) * _metres(crs)).tolist())
+        for edge in (header.mins, header.maxs)
     )
     summary = SourceInfo(
         path=path,
@@ -165,9 +167,9 @@ def open_las(path: str) -> RowSource:
         points=count,
         bounds=(lowest, highest) if count else None,
         fields=tuple((d.name, f"{d.num_bits} bit {d.kind.name}") for d in dimensions),
-        crs=crs,
+        crs=crs.crs,
         resident_bytes=resident,
-        notes=notes,
+        notes=crs.notes,
     )
     return RowSource(summary, rows)
 
@@ -224,12 +226,19 @@ def _checked_header(file: BinaryIO, size_bytes: int, path: str) -> tuple[int, in
     return points_at, point_bytes, count
 
 
-def _scaling(header: laspy.LasHeader, path: str) -> Scaling:
+def _metres(crs: Entered) -> Float64:
+    """Length of a unit of x, y and z [m]."""
+    return np.array([crs.xy.metres, crs.xy.metres, crs.z.metres])
+
+
+def _scaling(header: laspy.LasHeader, crs: Entered, path: str) -> Scaling:
+    """How stored integers become metres."""
     scale, offset = header.scales.tolist(), header.offsets.tolist()
     if not all(map(math.isfinite, scale + offset)) or 0.0 in scale:
         raise CorruptSourceError(
             f"{path}: scale {scale} and offset {offset} in its LAS header give no coordinates"
         )
+    scale, offset = ((edge * _metres(crs)).tolist() for edge in (header.scales, header.offsets))
     return Scaling(tuple(scale), tuple(offset))
 
 
@@ -295,24 +304,6 @@ def _check_layers(packed: bytes, packing: bytes, point_bytes: int) -> None:
             raise ValueError(f"its layers claim {sizes.tolist()} of {len(packed)} bytes")
 
 
-def _crs(header: laspy.LasHeader, path: str) -> tuple[str | None, tuple[str, ...]]:
-    """An EPSG code where the CRS has one, else its WKT."""
-    try:
-        crs: CRS | None = header.parse_crs()
-    except CRSError as error:
-        raise CrsError(
-            f"{path}: has a CRS that pyproj cannot read: {str(error)[:200]}; write it again with "
-            "another one"
-        ) from error
-    if crs is not None:
-        code = crs.to_epsg(min_confidence=100)
-        return (f"EPSG:{code}" if code else crs.to_wkt()), ()
-    records = [*header.vlrs, *(header.evlrs or ())]
-    if any(record.user_id == "LASF_Projection" for record in records):
-        return None, ("its projection records name no CRS by a code",)
-    return None, ()
-
-
 def write_las(path: str | os.PathLike[str], points: ArrayLike, *, crs: str | None = None) -> None:
     """Write points as LAS 1.4, rounded to 1 mm; compressed if the path ends with `.laz`.
 
@@ -336,7 +327,7 @@ def write_las(path: str | os.PathLike[str], points: ArrayLike, *, crs: str | Non
     if np.abs(table - header.offsets).max(initial=0.0) >= np.iinfo(np.int32).max * _SCALE:
         raise UsageError(f"{os.fspath(path)}: LAS holds 4,294 km in millimetres, no more")
     if crs is not None:
-        header.add_crs(_read_crs(crs))
+        header.add_crs(parsed(crs, os.fspath(path)))
     record = laspy.ScaleAwarePointRecord.zeros(len(table), header=header)
     record["X"], record["Y"], record["Z"] = np.rint((table - header.offsets) / _SCALE).T
     with Files.at(path).writing() as file:
@@ -346,10 +337,3 @@ def write_las(path: str | os.PathLike[str], points: ArrayLike, *, crs: str | Non
             file, header, do_compress=packed, laz_backend=backend, closefd=False
         ) as writer:
             writer.write_points(record)
-
-
-def _read_crs(crs: str) -> CRS:
-    try:
-        return CRS.from_user_input(crs)
-    except CRSError as error:
-        raise CrsError(f"pyproj cannot read the CRS {crs!r}: {error}") from error

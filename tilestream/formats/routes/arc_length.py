@@ -1,6 +1,7 @@
 """A route through points: its arc length and heading, and its points at equal arc length."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -87,7 +88,7 @@ def resample(route: Route, spacing: float = 1.0) -> Route:
     at = np.minimum(arc_length, length)
     positions = _at(route.positions, route.arc_length, at)
     heading = _heading(route.positions, route.arc_length, at)
-    return Route(route.route_id, positions, arc_length, heading, route.crs, route.dropped)
+    return replace(route, positions=positions, arc_length=arc_length, heading=heading)
 
 
 def require_length(route: Route, spacing: float) -> None:

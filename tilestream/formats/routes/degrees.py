@@ -1,18 +1,24 @@
-"""Coordinates in degrees: how they are told from metres, and their projection."""
+"""The CRS of a route: degrees told from metres, and the way from there to that of the map."""
+
+from collections.abc import Sequence
 
 import numpy as np
-from pyproj import CRS, Transformer
-from pyproj.exceptions import CRSError
 
+from tilestream.crs import enter, named, parsed, projection, require_same, same
 from tilestream.errors import CrsError
 from tilestream.kernels.fixed_order import norms
 from tilestream.records import Float64
 
 
 def metric(
-    path: str, points: list[Float64], crs: str | None, project_to: str | None, drawn: bool
-) -> list[Float64]:
-    """The points of each path of a file in metres: as they are, or projected from degrees.
+    path: str,
+    points: Sequence[Float64],
+    crs: str | None,
+    project_to: str | None,
+    map_crs: str | None,
+    drawn: bool,
+) -> tuple[list[Float64], str | None, tuple[str, ...]]:
+    """The points of each path of a file in metres: as they are, or projected.
 
     Coordinates are taken for degrees where the file says so, or where all fit longitude and
     latitude and either the whole file extends over less than 1 unit, or (in drawn routes; poses are
@@ -23,44 +29,77 @@ def metric(
         path: the file, for messages.
         points: (n, 3) points of each path, as the file gives them.
         crs: coordinate reference system of the file; None: it does not say.
-        project_to: CRS to project degrees to.
+        project_to: CRS to project to what is in degrees or in another one; None: that of the map.
+        map_crs: CRS of the map that the paths are for; what names none is in it. None: not known.
         drawn: whether the paths were drawn, not recorded: their points do not lie close together.
 
     Returns:
-        (n, 3) points of each path [m].
+        (n, 3) points of each path [m], their CRS (None: not known), and what was done to them.
 
     Raises:
-        CrsError: degrees without `project_to`, or that no place on earth has; metres with it; or a
-            CRS that cannot be used.
+        CrsError: degrees and no CRS to project them to, metres of no CRS with `project_to`, a
+            `project_to` that is not the map's, a place that is none on earth, or a CRS that cannot
+            be used.
     """
-    system, target = _crs(path, crs), _crs(path, project_to)
-    if target is not None and target.is_geographic:
-        raise CrsError(f"{path}: project_to = {project_to!r} is in degrees; name a metric CRS")
+    target = _target(path, project_to, map_crs)
+    system = None if crs is None else parsed(crs, path)
     degrees = system.is_geographic if system is not None else _look_like_degrees(points, drawn)
-    if not degrees:
-        if project_to is not None:
-            raise CrsError(f"{path}: is not in degrees, so it cannot be projected to {project_to}")
-        return points
-    _check_on_earth(path, points)
-    if target is None:
+    if degrees and target is None:
         raise CrsError(
             f"{path}: coordinates in degrees, not metres (or a path of less than a metre); project "
             "them to the map's CRS first, or name it as project_to"
         )
-    to_map = Transformer.from_crs(system or CRS.from_epsg(4326), target, always_xy=True)
-    projected = []
+    if degrees and target is not None:
+        _check_on_earth(path, points)
+        return _projected(path, points, crs or "EPSG:4326", target), target, ()
+    if crs is None:
+        if project_to is not None:
+            raise CrsError(f"{path}: is not in degrees, so it cannot be projected to {project_to}")
+        return list(points), map_crs, ()
+    found = enter(crs, path)
+    metres = np.array([found.xy.metres, found.xy.metres, found.z.metres])
+    points = points if found.metric else [xyz * metres for xyz in points]
+    if target is None or found.crs is None or same(found.crs, target):
+        return list(points), found.crs, found.notes
+    note = f"projected from {named(found.crs)} to the map's {named(target)}"
+    return _projected(path, points, found.crs, target), target, (*found.notes, note)
+
+
+def _target(path: str, project_to: str | None, map_crs: str | None) -> str | None:
+    """Where to project to: in metres, and the map's CRS where that is known."""
+    if project_to is None:
+        return map_crs
+    system = parsed(project_to, path)
+    if system.is_geographic:
+        raise CrsError(f"{path}: project_to = {project_to!r} is in degrees; name a metric CRS")
+    require_same("project_to", project_to, "the map", map_crs)
+    return map_crs or enter(project_to, "project_to").crs
+
+
+def _projected(path: str, points: Sequence[Float64], crs: str, target: str) -> list[Float64]:
+    """The points in another CRS; heights stay as they are.
+
+    Raises:
+        CrsError: PROJ knows no way there, or none for one of the points.
+    """
+    to_map = projection(crs, target, path)
+    found = []
     for xyz in points:
         x, y = to_map.transform(xyz[:, 0], xyz[:, 1])
-        known = np.isfinite(xyz[:, :2]).all(axis=1)
-        if not np.isfinite(np.stack([x, y])[:, known]).all():
-            raise CrsError(f"{path}: {project_to} cannot hold its places; name the map's CRS")
-        projected.append(np.column_stack([x, y, xyz[:, 2]]))
-    return projected
+        lost = ~(np.isfinite(x) & np.isfinite(y)) & np.isfinite(xyz[:, :2]).all(axis=1)
+        if lost.any():
+            place = ", ".join(f"{value:.6g}" for value in xyz[np.argmax(lost), :2])
+            raise CrsError(
+                f"{path}: ({place}) of {named(crs)} is nowhere in {named(target)}: is the CRS of "
+                "the file right, and is it of this map?"
+            )
+        found.append(np.column_stack([x, y, xyz[:, 2]]))
+    return found
 
 
-def _check_on_earth(path: str, points: list[Float64]) -> None:
+def _check_on_earth(path: str, points: Sequence[Float64]) -> None:
     """Refuse longitudes and latitudes that no place on earth has, with what they look like."""
-    every = np.concatenate(points)
+    every = np.concatenate(list(points))
     beyond = np.flatnonzero((np.abs(every[:, 0]) > 180) | (np.abs(every[:, 1]) > 90))
     if not len(beyond):
         return
@@ -75,14 +114,7 @@ def _check_on_earth(path: str, points: list[Float64]) -> None:
     raise CrsError(f"{path}: longitude {x:g}, latitude {y:g} is no place on earth; {like}")
 
 
-def _crs(path: str, name: str | None) -> CRS | None:
-    try:
-        return None if name is None else CRS.from_user_input(name)
-    except CRSError as error:
-        raise CrsError(f"{path}: {name!r} is no CRS that pyproj knows ({error})") from error
-
-
-def _look_like_degrees(points: list[Float64], drawn: bool) -> bool:
+def _look_like_degrees(points: Sequence[Float64], drawn: bool) -> bool:
     every = np.concatenate(points)[:, :2]
     every = every[np.isfinite(every).all(axis=1)]
     if len(every) < 2:

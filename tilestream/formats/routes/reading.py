@@ -41,6 +41,7 @@ def read_all_routes(
     *,
     crs: str | None = None,
     project_to: str | None = None,
+    map_crs: str | None = None,
     max_jump: float = 1000.0,
     z_offset: float | None = None,
     pose_topic: str | None = None,
@@ -65,13 +66,14 @@ def read_all_routes(
     the file's. Where several have one name, the second is called `name-2`, and so on, which is
     noted.
 
-    Coordinates in degrees (how they are told: `degrees.metric`) are refused unless `project_to`
-    says where to.
+    Coordinates in degrees (how they are told: `degrees.metric`) or in another CRS than the map's
+    are projected to it, which is noted; degrees are refused where no one says where to.
 
     Args:
         path: the file.
         crs: coordinate reference system of the file, where it does not say.
-        project_to: a metric CRS (any name that pyproj knows) to project degrees to.
+        project_to: a metric CRS (any name that pyproj knows) to project to; None: `map_crs`.
+        map_crs: CRS of the map that the routes are for; what names none is in it.
         max_jump: longest distance between successive points [m].
         z_offset: added to z, so that the route lies on the road: minus the height of the recorded
             frame. None: z as it is in the file; no z for a log, whose poses are the lidar's.
@@ -85,8 +87,8 @@ def read_all_routes(
     Raises:
         SourceNotFoundError: no such file.
         UnknownFormatError: an ending of no supported format.
-        CrsError: degrees without `project_to`, or that no place on earth has; or a CRS that cannot
-            be used.
+        CrsError: degrees without a CRS to project to, or that no place on earth has; a CRS that
+            cannot be used, or that is not the map's and cannot be brought there.
     """
     name = str(path)
     lift = z_offset or (np.nan if is_log(name) and z_offset is None else 0.0)
@@ -97,14 +99,18 @@ def read_all_routes(
             crs = crs or next((part.crs for part in paths), None)
             by_hand = not any(part.recorded for part in paths)
             positions = [part.positions for part in paths]
-            points = metric(name, positions, crs, project_to, by_hand) if paths else []
+            points, system, of_crs = (
+                metric(name, positions, crs, project_to, map_crs, by_hand)
+                if paths
+                else ([], None, ())
+            )
     except (SourceNotFoundError, UnknownFormatError, CrsError):
         raise
     except SourceError as error:
         return RoutesRead(lost=(Lost(Path(name).stem, error),))
     lost = [part for part in drawn if isinstance(part, Lost)]
     found: list[Route] = []
-    notes: list[str] = []
+    notes: list[str] = list(of_crs)
     for drawn_path, xyz in zip(paths, points, strict=True):
         parts, told = pieces(replace(drawn_path, positions=xyz + np.array([0.0, 0.0, lift])))
         notes += told
@@ -115,7 +121,7 @@ def read_all_routes(
                     route_of(
                         part.route_id,
                         part.positions,
-                        crs=project_to or crs,
+                        crs=system,
                         max_jump=max_jump,
                         where=where,
                     )
@@ -132,6 +138,7 @@ def read_routes(
     *,
     crs: str | None = None,
     project_to: str | None = None,
+    map_crs: str | None = None,
     max_jump: float = 1000.0,
     z_offset: float | None = None,
     pose_topic: str | None = None,
@@ -151,6 +158,7 @@ def read_routes(
         path,
         crs=crs,
         project_to=project_to,
+        map_crs=map_crs,
         max_jump=max_jump,
         z_offset=z_offset,
         pose_topic=pose_topic,
@@ -167,6 +175,7 @@ def read_route(
     route_id: str | None = None,
     crs: str | None = None,
     project_to: str | None = None,
+    map_crs: str | None = None,
     max_jump: float = 1000.0,
     z_offset: float | None = None,
     pose_topic: str | None = None,
@@ -180,6 +189,7 @@ def read_route(
         path,
         crs=crs,
         project_to=project_to,
+        map_crs=map_crs,
         max_jump=max_jump,
         z_offset=z_offset,
         pose_topic=pose_topic,

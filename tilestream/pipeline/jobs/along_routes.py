@@ -6,6 +6,7 @@ from typing import Any
 
 import pandas as pd
 
+from tilestream.crs import require_same
 from tilestream.errors import PartialError
 from tilestream.factors.catalogue import Which
 from tilestream.factors.rows import Samples, in_route_order, samples_by_tile
@@ -73,9 +74,29 @@ def factors_along(
     """
     routes = list(routes)
     looking = Looking(sensor, cell_size, which, sensor_height)
-    samples = samples_by_tile(store.grid, routes, spacing)
+    samples = samples_along(store, routes, spacing)
     plan = plan_factors(MapPlan.of_store(store, partial=partial), samples, out, looking, memory)
     return _tables_of(plan, factors.name, out, routes, client, watch)
+
+
+def samples_along(
+    store: TileStore, routes: Sequence[Route], spacing: float
+) -> dict[TileKey, Samples]:
+    """The sample points of routes by the tile of a map that holds them.
+
+    Args:
+        store: the map.
+        routes: where; each with a name of its own.
+        spacing: arc length between sample points [m].
+
+    Raises:
+        CrsError: a route in another CRS than the map.
+        UsageError: as `samples_by_tile`.
+    """
+    for route in routes:
+        where = f"{store.url}, the map,"
+        require_same(f"route {route.route_id}", route.crs, where, store.settings.crs)
+    return samples_by_tile(store.grid, routes, spacing)
 
 
 def plan_factors(
@@ -154,7 +175,7 @@ def observe_along(
         cell_size,
         sensor_height,
     )
-    samples = samples_by_tile(store.grid, routes, spacing)
+    samples = samples_along(store, routes, spacing)
     plan = plan_observe(MapPlan.of_store(store, partial=partial), samples, out, observing, memory)
     return _tables_of(plan, observe.name, out, routes, client, watch)
 

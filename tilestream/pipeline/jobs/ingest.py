@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from tilestream.crs import one_crs, same
 from tilestream.errors import (
     PartialError,
     SourceError,
@@ -24,7 +25,6 @@ from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.outputs import TileArrays
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, megabytes
 from tilestream.pipeline.engine.stage import Task
-from tilestream.pipeline.jobs.map_crs import one_crs
 from tilestream.pipeline.stages.merge import merge, merge_tasks
 from tilestream.pipeline.stages.scatter import (
     Fragment,
@@ -272,6 +272,24 @@ def read_sources(
     return Reading(store, found, memory, _is_current(store, found))
 
 
+def crs_of_map(sources: Iterable[str], url: str, asked: str | None) -> str | None:
+    """The CRS that a map has, or will have by the headers of its sources; None: a local frame.
+
+    Args:
+        sources: what it is made from; none: it is there.
+        url: where it is or will be.
+        asked: the CRS that is asked for; None: none is.
+
+    Raises:
+        SourceError, CrsError: as `ingest`.
+    """
+    try:
+        return open_store(url).settings.crs
+    except StoreNotFoundError:
+        named = [source for source in sources if not is_log(source)]
+        return _with_crs(IngestSettings(crs=asked), _examine_all(named, {})).crs if named else asked
+
+
 def plan_ingest(
     sources: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
     url: str | os.PathLike[str],
@@ -379,7 +397,7 @@ def _create_or_resume(url: str, settings: IngestSettings, found: Sequence[Source
         return TileStore.create(url, wanted)
     for name, value in asdict(wanted).items():
         there = getattr(store.settings, name)
-        if there != value and not (name == "crs" and value is None):
+        if there != value and not (name == "crs" and _fits(value, there)):
             raise UsageError(
                 f"{url} has {name} {there!r}, asked for is {value!r}: "
                 "use the same setting, or another path for the new store"
@@ -391,6 +409,11 @@ def _create_or_resume(url: str, settings: IngestSettings, found: Sequence[Source
             "or another path for the new store"
         )
     return store
+
+
+def _fits(asked: str | None, there: str | None) -> bool:
+    """Whether the CRS of a store is that of the map, or the map names none."""
+    return asked is None or (there is not None and same(asked, there))
 
 
 def _is_current(store: TileStore, found: Sequence[Source]) -> bool:

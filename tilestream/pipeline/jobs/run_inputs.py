@@ -13,7 +13,7 @@ from tilestream.model.dataset import made_with
 from tilestream.model.file import load_model
 from tilestream.model.training import check_making
 from tilestream.pipeline.engine.executor import Watch
-from tilestream.pipeline.jobs.ingest import Reading, read_sources
+from tilestream.pipeline.jobs.ingest import Reading, crs_of_map, read_sources
 from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.jobs.simulate import simulate
 from tilestream.pipeline.stages.drive_scans import Reading as DriveReading
@@ -63,7 +63,8 @@ def inputs_of(settings: RunSettings, client: Any | None, watch: Watch | None) ->
         files = settings.routes or tuple(dict.fromkeys(drive.log for drive in drives))
         if not files:
             return _inputs(settings.map.sources, drives, *_all_streets(settings))
-        read, notes = _routes(files, settings), tuple(_other_lidars(settings))
+        read = _routes(files, settings, settings.map.sources)
+        notes = tuple(_other_lidars(settings))
         return _inputs(settings.map.sources, drives, read.at_least(settings.spacing), notes)
     folder = simulated_folder(settings)
     wanted = settings.simulate
@@ -76,12 +77,13 @@ def inputs_of(settings: RunSettings, client: Any | None, watch: Watch | None) ->
         if wanted.paths is None or log.stem in wanted.paths
     ]
     preset = load_preset(wanted.preset)
-    read = _routes(settings.routes or (str(folder / "routes.geojson"),), settings)
+    sources = settings.map.sources or (str(folder / "survey" / "*.laz"),)
+    read = _routes(settings.routes or (str(folder / "routes.geojson"),), settings, sources)
     if wanted.paths is not None and not settings.routes:
         asked = tuple(route for route in read.routes if route.route_id in wanted.paths)
         read = replace(read, routes=asked)
     inputs = _inputs(
-        settings.map.sources or (str(folder / "survey" / "*.laz"),),
+        sources,
         settings.drives or tuple(logs),
         read.at_least(settings.spacing),
         (f"Simulated, preset {preset.preset}: {preset.note}",),
@@ -160,7 +162,7 @@ def _all_streets(settings: RunSettings) -> tuple[RoutesRead, tuple[str, ...]]:
             f"{settings.out}: no routes: give files of routes, drives, or a map directory with "
             f"{LANES} in map.sources"
         )
-    read = _routes(files, settings)
+    read = _routes(files, settings, sources)
     lanes = read.routes
     long = tuple(lane for lane in lanes if lane.arc_length[-1] >= settings.spacing)
     if not long:
@@ -174,14 +176,18 @@ def _all_streets(settings: RunSettings) -> tuple[RoutesRead, tuple[str, ...]]:
     return replace(read, routes=long), (told,)
 
 
-def _routes(files: Sequence[str], settings: RunSettings) -> RoutesRead:
-    """The routes of some files, each with a name of its own."""
+def _routes(files: Sequence[str], settings: RunSettings, sources: Sequence[str]) -> RoutesRead:
+    """The routes of some files, each with a name of its own, in the CRS of the map, which is made
+    from these sources.
+    """
+    map_crs = crs_of_map(sources, settings.store_url, settings.map.crs)
     of_log = {drive.log: drive for drive in reversed(settings.drives)}
     parts = []
     for path in files:  # the way of a drive is that of its own poses
         drive = of_log.get(path)
         topics = {} if drive is None else drive.model_dump(include={"pose_topic", "points_topic"})
-        parts.append(read_all_routes(path, project_to=settings.project_to, **topics))
+        project_to = settings.project_to
+        parts.append(read_all_routes(path, project_to=project_to, map_crs=map_crs, **topics))
     return together(parts)
 
 

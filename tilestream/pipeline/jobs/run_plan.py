@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from tilestream.factors import catalogue
-from tilestream.factors.rows import Samples, samples_by_tile
+from tilestream.factors.rows import Samples
 from tilestream.factors.virtual_drive import NEIGHBOURS
 from tilestream.grid import MM_PER_M, TileGrid, TileKey
 from tilestream.model.baselines import Median
@@ -21,7 +21,7 @@ from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.outputs import Parquet
 from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.engine.stage import Readable, Task
-from tilestream.pipeline.jobs.along_routes import plan_factors, plan_observe
+from tilestream.pipeline.jobs.along_routes import plan_factors, plan_observe, samples_along
 from tilestream.pipeline.jobs.localize import labelled_places, plan_localize
 from tilestream.pipeline.jobs.run_inputs import (
     Inputs,
@@ -61,7 +61,7 @@ def plan_measure(settings: RunSettings, inputs: Inputs, map_plan: MapPlan) -> Pl
     """
     tables = f"{settings.out}/tables"
     looking = Looking(settings.looking_sensor, settings.cell_size, "all", settings.sensor_height)
-    places = samples_by_tile(map_plan.store.grid, inputs.routes, settings.spacing)
+    places = samples_along(map_plan.store, inputs.routes, settings.spacing)
     memory = settings.memory
     plans = [plan_factors(map_plan, places, tables, looking, memory)]
     if settings.observe is not None:
