@@ -5,6 +5,7 @@ import re
 import shutil
 from pathlib import Path
 
+import laspy
 import numpy as np
 import pytest
 
@@ -75,6 +76,65 @@ def test_a_crs_with_heights_is_the_same_map(map_cases: Path, tmp_path: Path) -> 
     assert store.settings.crs == "EPSG:32654"
     assert len(points_of(store)) == 2 * STREET
     assert "EGM2008 height" in notes_of(store)
+
+
+def test_all_points_of_a_legacy_count(cases: Path, tmp_path: Path) -> None:
+    assert describe(cases / "las14_legacy_count_only.las").points == STREET
+    assert len(points_of(made(cases / "las14_legacy_count_only.las", tmp_path))) == STREET
+
+
+@pytest.mark.parametrize("name", ["nan_bounds.las", "zero_bounds.las"])
+def test_impossible_bounds_are_read_from_the_points(
+    name: str, cases: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["info", str(cases / name), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    np.testing.assert_allclose(found["bounds"], [LOW, HIGH], atol=1e-9)
+    assert any("the bounds in its header" in note for note in found["notes"])
+
+
+def test_a_plan_does_not_believe_impossible_bounds(
+    cases: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "way.csv").write_text("x,y,z\n5,0,0\n35,0,0\n")
+    job = {
+        "out": str(tmp_path / "job"),
+        "map": {"sources": [str(cases / "zero_bounds.las")], "tile_size": 10.0},
+        "routes": [str(tmp_path / "way.csv")],
+        "model": {"recipe": "physics"},
+        "observe": {},
+    }
+    (tmp_path / "job.yaml").write_text(json.dumps(job))
+    assert run(["plan", str(tmp_path / "job.yaml")]) == 0
+    assert "at most 12 tiles" in " ".join(capsys.readouterr().out.split())
+
+
+def test_noise_and_withheld_points_are_left_out(
+    cases: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, url = cases / "noise_and_withheld.laz", str(tmp_path / "map.zarr")
+    asked = ["ingest", str(file), "--store", url, "--map-leaf", "0"]
+    assert run(asked) == 0
+    assert points_of(ts.open_store(url))[:, 2].max() < 10.0
+    las = laspy.read(file)
+    bad = np.isin(las.classification, (7, 18)) | (np.asarray(las.withheld) == 1)
+    assert len(points_of(ts.open_store(url))) == STREET - bad.sum()
+    told = " ".join(capsys.readouterr().out.split())
+    assert f"{bad.sum():,} points of a class of noise (7 or 18) or withheld are left out" in told
+    assert run([*asked, "--keep-noise"]) == 0
+    assert len(points_of(ts.open_store(url))) == STREET
+    assert "noise (7" not in capsys.readouterr().out
+    assert run(asked) == 0
+    assert len(points_of(ts.open_store(url))) == STREET - bad.sum()
+
+
+def test_a_zero_point_among_utm_coordinates_is_left_out(cases: Path, tmp_path: Path) -> None:
+    store = made(cases / "utm_with_zero_point.pcd", tmp_path)
+    assert len(points_of(store)) == STREET
+    assert np.ptp(points_of(store), axis=0).max() < 50.0
+    (source,) = store.sources()
+    assert source["points"] == STREET
+    assert "10 km from all others: 1 of 7,716 points, 1 near (0, 0) m: left out" in notes_of(store)
 
 
 def test_a_crs_that_cannot_be_read_gives_way_to_what_the_user_says(

@@ -373,14 +373,48 @@ def test_coordinates_that_do_not_fit_the_grid_are_named(
     tmp_path: Path, place: tuple[float, float, float]
 ) -> None:
     write_pcd(tmp_path / "stray.pcd", np.array([[0.0, 0.0, 0.0], place]))
-    with pytest.raises(PartialError, match=r"stray\.pcd.*does not fit the tile grid"):
+    with pytest.raises(PartialError, match=r"stray\.pcd.*outside of the tile grid: 1 of 2 points"):
         ts.ingest(tmp_path / "stray.pcd", tmp_path / "map.zarr")
+    write_pcd(tmp_path / "few.pcd", np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], place]))
+    (source,) = ts.ingest(tmp_path / "few.pcd", tmp_path / "few.zarr").sources()
+    assert source["points"] == 2
+    x, y, z = (f"{value:.6g}" for value in place)
+    assert f"1 of 3 points, first ({x}, {y}, {z}) m: left out" in "".join(source["notes"])
 
 
 def test_a_stray_point_does_not_take_all_memory(tmp_path: Path) -> None:
     write_pcd(tmp_path / "stray.pcd", np.array([[0.0, 0.0, 0.0], [9e7, 9e7, 0.0]]))
-    with pytest.raises(PartialError, match=r"spans .* tiles"):
+    with pytest.raises(PartialError, match=r"stray\.pcd: 10 km from all others: 1 of 2 points"):
         ts.ingest(tmp_path / "stray.pcd", tmp_path / "map.zarr", tile_size=1.0)
+
+
+def test_points_all_over_the_place_are_refused(tmp_path: Path) -> None:
+    everywhere = np.random.default_rng(0).uniform(-9e7, 9e7, (5000, 3)) / [1, 1, 100]
+    write_pcd(tmp_path / "a.pcd", everywhere)
+    with pytest.raises(PartialError, match=r"a\.pcd.*spans .* tiles of 1 m, all over them"):
+        ts.ingest(tmp_path / "a.pcd", tmp_path / "map.zarr", tile_size=1.0)
+
+
+def test_two_districts_of_a_file_are_one_map(tmp_path: Path) -> None:
+    here = np.random.default_rng(0).uniform(0.0, 50.0, (200, 3))
+    write_pcd(tmp_path / "a.pcd", np.concatenate([here, here + np.array([4e5, 3e5, 0.0])]))
+    (source,) = ts.ingest(tmp_path / "a.pcd", tmp_path / "map.zarr").sources()
+    assert (source["points"], source["notes"]) == (400, [])
+
+
+def test_what_is_a_stray_does_not_depend_on_how_a_source_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cloud = np.random.default_rng(0).uniform(0.0, 90.0, (2000, 3))
+    cloud[:, :2] += 381_000.0, 3_950_000.0
+    cloud[::300] = 0.0
+    write_pcd(tmp_path / "a.pcd", cloud)
+    whole = ts.ingest(tmp_path / "a.pcd", tmp_path / "a.zarr")
+    monkeypatch.setattr(ingest_map, "POINTS_PER_TASK", 300)
+    split = ts.ingest(tmp_path / "a.pcd", tmp_path / "b.zarr")
+    assert split.identities() == whole.identities()
+    assert split.sources()[0]["notes"] == whole.sources()[0]["notes"]
+    assert whole.sources()[0]["points"] == 1993
 
 
 def test_two_crs_are_refused_before_anything_is_written(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from fuzz_bombs import of_laz
 from points import points_of
 
 from tilestream.errors import CorruptSourceError, CrsError
-from tilestream.formats import open_source
+from tilestream.formats import describe, open_source
 from tilestream.formats.points.las import open_las, write_las
 
 
@@ -190,3 +190,51 @@ def test_claims_of_the_header_are_checked(tmp_path: Path) -> None:
         path.write_bytes(content)
         with pytest.raises(CorruptSourceError, match=message):
             open_source(path)
+
+
+@pytest.mark.parametrize("point_format", range(11))
+@pytest.mark.parametrize("name", ["a.las", "a.laz"])
+def test_noise_is_left_out_whatever_the_point_format(
+    point_format: int, name: str, tmp_path: Path
+) -> None:
+    if name.endswith("laz") and point_format in (4, 5, 9, 10):
+        pytest.skip("lazrs packs no wave packets")
+    header = laspy.LasHeader(version="1.4", point_format=point_format)
+    las = laspy.LasData(header)
+    las.x = las.y = las.z = np.arange(8.0)
+    las.classification = np.array([0, 7, 2, 18, 1, 6, 2, 7], np.uint8)
+    las.withheld = np.array([0, 0, 1, 0, 0, 0, 0, 1])
+    las.synthetic = las.key_point = np.array([1, 0, 0, 0, 0, 1, 0, 0])
+    las.write(tmp_path / name)
+    source = open_source(tmp_path / name)
+    (block,) = source.blocks(source.spans(8)[0], 8)
+    assert block.points[:, 0].tolist() == [0.0, 4.0, 5.0, 6.0]
+    assert (block.left_out, block.dropped) == (4, 0)
+    source = open_source(tmp_path / name, keep_noise=True)
+    (block,) = source.blocks(source.spans(8)[0], 8)
+    assert (len(block.points), block.left_out) == (8, 0)
+
+
+@pytest.mark.parametrize(
+    "bounds",
+    [
+        (np.nan,) * 6,
+        (0.0,) * 6,
+        (-np.inf, np.inf) * 3,
+        (np.finfo(float).min, np.finfo(float).max) * 3,
+        (7e5, 6e5, 7e5, 6e5, 7e5, 6e5),
+    ],
+)
+@pytest.mark.parametrize("name", ["a.las", "a.laz"])
+def test_bounds_that_cannot_be_are_those_of_the_points(
+    bounds: tuple[float, ...], name: str, tmp_path: Path
+) -> None:
+    write_las(tmp_path / name, [[5.0, 6.0, 7.0], [8.0, 9.0, 10.0]])
+    content = bytearray((tmp_path / name).read_bytes())
+    assert describe(tmp_path / name).notes == ()
+    content[179:227] = struct.pack("<6d", *bounds)  # highest and lowest, of x, y and z
+    (tmp_path / name).write_bytes(content)
+    assert open_source(tmp_path / name).info().bounds is None
+    found = describe(tmp_path / name)
+    assert found.bounds == ((5.0, 6.0, 7.0), (8.0, 9.0, 10.0))
+    assert "the bounds in its header" in found.notes[0]

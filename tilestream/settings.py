@@ -80,6 +80,8 @@ class IngestSettings(Settings):
     """Edge of the voxels that the map is thinned to, one centroid each [m]; 0 keeps all points."""
     crs: str | None = None
     """CRS of the map, any string that pyproj reads; not given: that of the sources."""
+    keep_noise: bool = False
+    """Keep the points of LAS files that are of a class of noise (7 or 18), or withheld."""
 
 
 class MapSettings(IngestSettings, LogSettings):

@@ -17,7 +17,7 @@ from tilestream.errors import PartialError
 from tilestream.formats import describe
 from tilestream.pipeline.jobs import ingest as ingest_map
 from tilestream.pipeline.jobs.run_inputs import ingest_settings, scans_of
-from tilestream.settings import MapSettings, PlaceSettings
+from tilestream.settings import IngestSettings, MapSettings, PlaceSettings
 from tilestream.store import POINTS, TileStore, open_store
 
 LOG_FIELDS = ("points_topic", "pose_topic", "every", "offset", "from_s", "until_s")
@@ -31,7 +31,7 @@ def ingest(
         list[str], typer.Argument(help="Files, globs, Autoware map directories, mixed.")
     ],
     store: Annotated[str, typer.Option(help="The tile store: a path or an fsspec URL.")],
-    how: Annotated[MapSettings, fields("tile_size", "halo", "map_leaf", "crs", *LOG_FIELDS)],
+    how: Annotated[MapSettings, fields(*IngestSettings.model_fields, *LOG_FIELDS)],
     limits: Annotated[PlaceSettings, fields("memory")],
     dry_run: DryRun = False,
     cluster: Cluster = HERE,

@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from tilestream.errors import SourceNotFoundError, UsageError
-from tilestream.formats.base import Block, PointSource, SourceInfo, Span
+from tilestream.formats.base import Block, PointSource, SourceInfo, Span, corner_of
 from tilestream.formats.drive import DRIVES
 from tilestream.formats.points import autoware, e57, las, pcd, ply
 from tilestream.formats.registry import Format, format_of, format_of_directory
-from tilestream.records import Float64
 
 __all__ = [
     "FORMATS",
@@ -69,28 +68,29 @@ def open_source(path: str | os.PathLike[str], **options: object) -> PointSource:
 def describe(path: str | os.PathLike[str], **options: object) -> SourceInfo:
     """What is in a file, as `PointSource.info`, and its bounds also where no header tells them.
 
-    For those a file of up to 1 GB is read; a note says how many of its points are not finite.
+    For those a file of up to 1 GB is read; notes say how many of its points are not finite, and how
+    many the file marks as noise or withheld, which do not count.
     Arguments and errors as for `open_source`.
     """
     source = open_source(path, **options)
     found = source.info()
     if found.bounds is not None or not found.points or found.size_bytes > _READ_MAX:
         return found
-    lowest, highest, dropped = np.full(3, np.inf), np.full(3, -np.inf), 0
+    lowest, highest, dropped, left_out = np.full(3, np.inf), np.full(3, -np.inf), 0, 0
     for span in source.spans(found.points):
         for block in source.blocks(span, _BLOCK):
             lowest = np.minimum(lowest, block.points.min(axis=0, initial=np.inf))
             highest = np.maximum(highest, block.points.max(axis=0, initial=-np.inf))
             dropped += block.dropped
-    notes = (*found.notes, f"{dropped} points are not finite") if dropped else found.notes
-    if dropped == found.points:
+            left_out += block.left_out
+    notes = found.notes
+    if dropped:
+        notes += (f"{dropped} points are not finite",)
+    if left_out:
+        notes += (f"{left_out} points are of a class of noise or withheld",)
+    if dropped + left_out == found.points:
         return replace(found, notes=notes)
-    return replace(found, bounds=(_corner(lowest), _corner(highest)), notes=notes)
-
-
-def _corner(corner: Float64) -> tuple[float, float, float]:
-    x, y, z = corner.tolist()
-    return x, y, z
+    return replace(found, bounds=(corner_of(lowest), corner_of(highest)), notes=notes)
 
 
 def expand_sources(

@@ -6,6 +6,16 @@ from typing import Protocol
 
 from tilestream.records import Float64
 
+Corner = tuple[float, float, float]
+Bounds = tuple[Corner, Corner]
+"""Lowest and highest x, y, z [m, map frame]."""
+
+
+def corner_of(xyz: Float64) -> Corner:
+    """x, y and z as plain numbers."""
+    x, y, z = xyz.tolist()
+    return x, y, z
+
 
 @dataclass(frozen=True, kw_only=True)
 class SourceInfo:
@@ -19,7 +29,7 @@ class SourceInfo:
     """Size of the file [bytes]."""
     points: int | None
     """Number of points that the file holds; None where only reading it whole can tell."""
-    bounds: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
+    bounds: Bounds | None = None
     """Lowest and highest x, y, z [m, map frame], where the header tells; else None."""
     fields: tuple[tuple[str, str], ...]
     """Name and type of each field of a point, as the file names them, e.g. `("x", "float32")`."""
@@ -48,6 +58,8 @@ class Block:
     """(n, 3) finite points [m, map frame], n >= 0."""
     dropped: int
     """Points of the file that were not finite and are not here."""
+    left_out: int = 0
+    """Points that the file itself marks as noise or withheld, and that are not here."""
 
 
 class PointSource(Protocol):

@@ -23,15 +23,17 @@ from numpy.typing import ArrayLike, NDArray
 from tilestream.crs import Entered, parsed
 from tilestream.errors import CorruptSourceError, UsageError
 from tilestream.files import Files
-from tilestream.formats.base import Block, SourceInfo, Span
+from tilestream.formats.base import Block, Bounds, SourceInfo, Span, corner_of
 from tilestream.formats.points.las_crs import crs_of
 from tilestream.formats.points.rows import (
     BinaryRows,
     Column,
+    Flag,
     RowSource,
     Scaling,
     as_points,
     finite_block,
+    flagged,
     steps,
     whole_span,
 )
@@ -51,10 +53,25 @@ _SCALE = 0.001
 _INT32 = np.dtype("<i4")
 _XYZ = (Column(0, _INT32), Column(4, _INT32), Column(8, _INT32))
 """X, Y and Z begin every point, whatever its format."""
-_ONLY_XYZ = lazrs.DecompressionSelection(
-    lazrs.SELECTIVE_DECOMPRESS_XY_RETURNS_CHANNEL | lazrs.SELECTIVE_DECOMPRESS_Z
+_DECODED = lazrs.DecompressionSelection(
+    lazrs.SELECTIVE_DECOMPRESS_XY_RETURNS_CHANNEL
+    | lazrs.SELECTIVE_DECOMPRESS_Z
+    | lazrs.SELECTIVE_DECOMPRESS_CLASSIFICATION
+    | lazrs.SELECTIVE_DECOMPRESS_FLAGS
 )
 """What is decoded of a LAZ point where its format can be decoded in parts (6 to 10)."""
+_NOISE = (7, 18)
+"""Classes of points that are noise: low, and high."""
+_WITHHELD = bytes(bool(value & 0x04) for value in range(256))
+"""The flags of a point of the formats 6 to 10, which have a byte for them …"""
+_CLASSIFIED = bytes(value in _NOISE for value in range(256))
+"""… and one for the class."""
+_EITHER = bytes(bool(value & 0x80) or value & 0x1F in _NOISE for value in range(256))
+"""The one byte that the formats 0 to 5 have for both."""
+_FLAGS_AT = 15
+"""Where that byte is in a point, or the first of the two."""
+_OUTSIDE = 1.0
+"""How far the first point may be outside of the header's bounds before they are wrong [m]."""
 _LARGEST_CHUNK = 1 << 28
 """What a chunk may claim to unpack to [bytes]: 7 million points, and writers choose 50,000."""
 _LAYERED = 3
@@ -89,6 +106,8 @@ class LazRows:
     """How lazrs is told the compression: the record of LAZ in the file's header."""
     dtype: np.dtype[Any]
     """Type of an unpacked point."""
+    flags: tuple[Flag, ...]
+    """What leaves points out."""
 
     def spans(self, points: int) -> list[Span]:
         """Whole chunks, at least one each."""
@@ -108,9 +127,11 @@ class LazRows:
                 if start >= stop:
                     continue
                 points = self._unpack(file, chunk)
+                rows = points.view(np.uint8).reshape(len(points), self.dtype.itemsize)
                 for step in steps(Span(start, stop), block_points):
-                    part = points[step.start - chunk.span.start : step.stop - chunk.span.start]
-                    yield finite_block(part["X"], part["Y"], part["Z"], self.scaling)
+                    part = slice(step.start - chunk.span.start, step.stop - chunk.span.start)
+                    x, y, z = (points[name][part] for name in "XYZ")
+                    yield finite_block(x, y, z, self.scaling, flagged(rows[part], self.flags))
 
     def _unpack(self, file: BinaryIO, chunk: _Chunk) -> NDArray[Any]:
         """A chunk by itself: lazrs' own seek goes astray where chunks differ in size (COPC)."""
@@ -121,14 +142,18 @@ class LazRows:
         with _laspy_errors(self.path, f"points {chunk.span.start} to {chunk.span.stop - 1}"):
             _check_layers(packed, self.packing, self.dtype.itemsize)
             lazrs.decompress_points_with_chunk_table(
-                packed, self.packing, points.view(np.uint8), [(count, len(packed))], _ONLY_XYZ
+                packed, self.packing, points.view(np.uint8), [(count, len(packed))], _DECODED
             )
         return points
 
 
-def open_las(path: str) -> RowSource:
+def open_las(path: str, *, keep_noise: bool = False) -> RowSource:
     """A LAS or LAZ file; its header and chunk table are read and checked against its size. A
     coordinate is stored integer x scale + offset, in float64, brought to metres.
+
+    Args:
+        path: the file.
+        keep_noise: also read the points that are of a class of noise, or withheld.
 
     Raises:
         CorruptSourceError: the file is too short for what its header claims, or damaged.
@@ -144,32 +169,33 @@ def open_las(path: str) -> RowSource:
             dtype = header.point_format.dtype()
         crs = crs_of(header, path)
         scaling = _scaling(header, crs, path)
-        plain = BinaryRows(path, points_at, point_bytes, count, _XYZ, scaling)
+        flags = () if keep_noise else _flags(header.point_format.id)
+        plain = BinaryRows(path, points_at, point_bytes, count, _XYZ, scaling, flags)
         rows: BinaryRows | LazRows = plain
-        resident = 0
+        resident, first_at = 0, points_at
         if header.are_points_compressed:
             with _laspy_errors(path, "LAZ record"):
                 packing = bytes(header.vlrs[header.vlrs.index("LasZipVlr")].record_data)
             chunks = _chunks(file, packing, plain, size_bytes)
-            rows = LazRows(path, count, scaling, chunks, packing, dtype)
+            rows = LazRows(path, count, scaling, chunks, packing, dtype, flags)
+            first_at = chunks[0].offset if chunks else points_at
             sizes = (c.packed_bytes + point_bytes * (c.span.stop - c.span.start) for c in chunks)
             resident = max(sizes, default=0)
         else:
             plain.check_size(size_bytes)
-    lowest, highest = (
-        tuple((np.asarray(edge, float) * _metres(crs)).tolist())
-        for edge in (header.mins, header.maxs)
-    )
+        file.seek(first_at)
+        first = np.frombuffer(file.read(_INT32.itemsize * 3), _INT32)
+    bounds, notes = _bounds(header, crs, scaling, first) if count else (None, ())
     summary = SourceInfo(
         path=path,
         format=f"{'laz' if header.are_points_compressed else 'las'} {header.version}",
         size_bytes=size_bytes,
         points=count,
-        bounds=(lowest, highest) if count else None,
+        bounds=bounds,
         fields=tuple((d.name, f"{d.num_bits} bit {d.kind.name}") for d in dimensions),
         crs=crs.crs,
         resident_bytes=resident,
-        notes=crs.notes,
+        notes=(*crs.notes, *notes),
     )
     return RowSource(summary, rows)
 
@@ -180,6 +206,7 @@ FORMAT = Format(
     open=open_las,
     endings=(".las", ".laz"),
     magic=b"LASF",
+    options=("keep_noise",),
 )
 
 
@@ -207,7 +234,8 @@ def _checked_header(file: BinaryIO, size_bytes: int, path: str) -> tuple[int, in
     _, header_bytes, points_at, vlrs, _, point_bytes, count = _HEADER.unpack_from(head)
     evlrs_at, evlrs = 0, 0
     if head[25] >= 4 and len(head) == 375:
-        evlrs_at, evlrs, count = _HEADER_1_4.unpack_from(head, 235)
+        evlrs_at, evlrs, whole_count = _HEADER_1_4.unpack_from(head, 235)
+        count = whole_count or count  # some writers fill only the one of older versions
     if header_bytes + vlrs * _VLR_MIN > points_at or points_at > size_bytes or point_bytes < 20:
         raise CorruptSourceError(
             f"{path}: its LAS header claims {vlrs} VLRs behind {header_bytes} bytes and points of "
@@ -224,6 +252,33 @@ def _checked_header(file: BinaryIO, size_bytes: int, path: str) -> tuple[int, in
                 "cut short or damaged"
             )
     return points_at, point_bytes, count
+
+
+def _flags(point_format: int) -> tuple[Flag, ...]:
+    """What says of a point that it is noise or withheld."""
+    if point_format < 6:
+        return (Flag(_FLAGS_AT, _EITHER),)
+    return (Flag(_FLAGS_AT, _WITHHELD), Flag(_FLAGS_AT + 1, _CLASSIFIED))
+
+
+def _bounds(
+    header: laspy.LasHeader, crs: Entered, scaling: Scaling, first: NDArray[np.int32]
+) -> tuple[Bounds | None, tuple[str, ...]]:
+    """The header's bounds [m], where they can be those of its points; else None and a note.
+
+    Args:
+        header: the header.
+        crs: what brings it to metres.
+        scaling: how stored integers become metres.
+        first: the first point as it is stored, which a chunk begins with uncompressed.
+    """
+    low, high = (np.asarray(edge, float) * _metres(crs) for edge in (header.mins, header.maxs))
+    point = first * np.array(scaling.scale) + scaling.offset
+    inside = (low - _OUTSIDE <= point) & (point <= high + _OUTSIDE)
+    if np.isfinite([low, high]).all() and (low <= high).all() and inside.all():
+        return (corner_of(low), corner_of(high)), ()
+    told = " to ".join(str(edge.tolist()) for edge in (low, high))
+    return None, (f"the bounds in its header, {told} m, cannot be: only its points tell",)
 
 
 def _metres(crs: Entered) -> Float64:

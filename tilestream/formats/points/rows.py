@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice, pairwise
 from pathlib import Path
@@ -143,10 +143,38 @@ METRES = Scaling()
 """Coordinates stored in metres."""
 
 
+@dataclass(frozen=True)
+class Flag:
+    """A byte of each row that may say that its point is to be left out."""
+
+    offset: int
+    """Bytes from the start of the row."""
+    values: bytes
+    """256 bytes: 1 for each value of it that says so."""
+
+
+def flagged(rows: NDArray[np.uint8], flags: Sequence[Flag]) -> NDArray[np.bool_]:
+    """Which of (n, size) rows a flag leaves out, (n,)."""
+    found = np.zeros(len(rows), np.bool_)
+    for flag in flags:
+        found |= np.frombuffer(flag.values, np.bool_)[rows[:, flag.offset]]
+    return found
+
+
 def finite_block(
-    x: NDArray[Any], y: NDArray[Any], z: NDArray[Any], scaling: Scaling = METRES
+    x: NDArray[Any],
+    y: NDArray[Any],
+    z: NDArray[Any],
+    scaling: Scaling = METRES,
+    left_out: NDArray[np.bool_] | None = None,
 ) -> Block:
-    """The points of three columns of stored numbers, without those that are NaN or infinite."""
+    """The points of three columns of stored numbers, without those that are NaN or infinite, nor
+    those to be left out.
+    """
+    if left_out is not None and left_out.any():
+        kept_rows = ~left_out
+        block = finite_block(x[kept_rows], y[kept_rows], z[kept_rows], scaling)
+        return replace(block, left_out=int(np.count_nonzero(left_out)))
     points = np.empty((len(x), 3))
     scale, offset = np.array(scaling.scale), np.array(scaling.offset)
     x, y, z = _native(x, y, z)
@@ -178,6 +206,8 @@ class BinaryRows:
     """Where x, y and z lie in a row."""
     scaling: Scaling = METRES
     """How the stored numbers become metres."""
+    flags: tuple[Flag, ...] = ()
+    """What leaves points out."""
 
     def spans(self, points: int) -> list[Span]:
         """Any pieces, of equal size."""
@@ -203,7 +233,8 @@ class BinaryRows:
                 n = step.stop - step.start
                 self._fill(file, room[: n * self.size], self.offset + step.start * self.size)
                 x, y, z = (self._view(room, n, column) for column in self.columns)
-                yield finite_block(x, y, z, self.scaling)
+                rows = room[: n * self.size].reshape(n, self.size)
+                yield finite_block(x, y, z, self.scaling, flagged(rows, self.flags))
 
     def _view(self, room: NDArray[np.uint8], n: int, column: Column) -> NDArray[Any]:
         return np.ndarray((n,), column.dtype, room.data, column.offset, (self.size,))

@@ -9,7 +9,7 @@ from tilestream.formats import describe
 from tilestream.grid import MM_PER_M, Box, TileKey
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.stage import Task
-from tilestream.pipeline.jobs.ingest import plan_ingest
+from tilestream.pipeline.jobs.ingest import plan_ingest, store_settings
 from tilestream.pipeline.jobs.run_inputs import (
     Inputs,
     check_model,
@@ -27,7 +27,7 @@ from tilestream.pipeline.jobs.simulate import plan_simulation
 from tilestream.pipeline.stages.map_plan import MapPlan, TilePoints
 from tilestream.pipeline.stages.scatter import SourceSpan
 from tilestream.settings import SimulateSettings
-from tilestream.store import StoreSettings, TileStore, open_store
+from tilestream.store import TileStore, open_store
 
 
 @dataclass(frozen=True)
@@ -96,9 +96,7 @@ def _expected_map(
         settings.map.pose_topic,
         map_scans(settings, inputs),
     )
-    store = TileStore(
-        settings.store_url, StoreSettings(**ingest_settings(settings.map).model_dump())
-    )
+    store = TileStore(settings.store_url, store_settings(ingest_settings(settings.map)))
     have: dict[TileKey, TilePoints] = {}
     unknown: list[str] = []
     spans = [task.reads["blocks"] for task in plan.tasks]

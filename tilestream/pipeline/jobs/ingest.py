@@ -2,12 +2,13 @@
 
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 from tilestream.crs import one_crs, same
 from tilestream.errors import (
+    CorruptSourceError,
     PartialError,
     SourceError,
     SourceNotFoundError,
@@ -25,6 +26,7 @@ from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.outputs import TileArrays
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, megabytes
 from tilestream.pipeline.engine.stage import Task
+from tilestream.pipeline.jobs.strays import Kept, without_strays
 from tilestream.pipeline.stages.merge import merge, merge_tasks
 from tilestream.pipeline.stages.scatter import (
     Fragment,
@@ -73,6 +75,7 @@ def ingest(
     halo: float = 10.0,
     map_leaf: float = 0.2,
     crs: str | None = None,
+    keep_noise: bool = False,
     client: Any | None = None,
     memory: int = DEFAULT_MEMORY,
     watch: Watch | None = None,
@@ -94,6 +97,7 @@ def ingest(
         halo: what tasks read around a tile [m].
         map_leaf: edge of the voxels that the map is thinned to [m]; 0 keeps all points.
         crs: CRS of the map; None: that of the sources.
+        keep_noise: keep the points of LAS files that are of a class of noise, or withheld.
         client: a Dask client to run on; None: this process.
         memory: what a task may use [bytes].
         watch: is told of each task that ended.
@@ -113,7 +117,9 @@ def ingest(
         PartialError: some sources or tiles failed; the message lists them with reasons, and
             the rest is done and can be opened.
     """
-    settings = IngestSettings(tile_size=tile_size, halo=halo, map_leaf=map_leaf, crs=crs)
+    settings = IngestSettings(
+        tile_size=tile_size, halo=halo, map_leaf=map_leaf, crs=crs, keep_noise=keep_noise
+    )
     with only_writer(url):
         reading = read_sources(sources, url, settings, memory, points_topic, pose_topic, scans)
         outcomes = execute(reading.first(), client, watch, grow=lambda o: reading.grown(o) or ())
@@ -184,11 +190,13 @@ class Reading:
                 self.found[number] = replace(source, reason=failed[0])
             elif not source.reason:
                 indices = [Fragment.of(outcome.facts) for outcome in parts]
-                points, dropped = (
-                    sum(getattr(index, name) for index in indices) for name in ("points", "dropped")
-                )
-                self.found[number] = replace(source, points=points, dropped=dropped)
-                fragments += indices
+                try:
+                    kept = without_strays(source.path, indices, self.store.grid)
+                except CorruptSourceError as error:
+                    self.found[number] = replace(source, reason=str(error))
+                    continue
+                self.found[number] = _as_read(source, indices, kept)
+                fragments += kept.fragments
         fragments.sort(key=lambda fragment: [int(part) for part in fragment.name.split("-")])
         self.merges = merge_tasks(self.store, fragments, self._memory).tasks
         failures = self._unread()
@@ -257,6 +265,19 @@ class Reading:
         )
 
 
+def _as_read(source: Source, indices: Sequence[Fragment], kept: Kept) -> Source:
+    """A source with what was read of it, and what was left out."""
+    left_out = sum(index.left_out for index in indices)
+    notes = kept.notes
+    if left_out:
+        told = "points of a class of noise (7 or 18) or withheld are left out"
+        notes += (f"{left_out:,} {told}; --keep-noise keeps them",)
+    assert source.info is not None
+    info = replace(source.info, notes=(*source.info.notes, *notes))
+    dropped = sum(index.dropped for index in indices)
+    return replace(source, info=info, points=kept.points, dropped=dropped)
+
+
 def read_sources(
     sources: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
     url: str | os.PathLike[str],
@@ -267,9 +288,15 @@ def read_sources(
     scans: ScanSelection | None = None,
 ) -> Reading:
     """What `ingest` begins with; arguments and errors as there."""
-    found = _within(_examine_all(sources, _log_options(points_topic, pose_topic, scans)), memory)
+    options = _log_options(points_topic, pose_topic, scans)
+    found = _within(_examine_all(sources, settings, options), memory)
     store = _create_or_resume(str(url), _with_crs(settings, found), found)
     return Reading(store, found, memory, _is_current(store, found))
+
+
+def store_settings(settings: IngestSettings) -> StoreSettings:
+    """What of the settings a store is: the rest is how its sources are read."""
+    return StoreSettings(**settings.model_dump(include={f.name for f in fields(StoreSettings)}))
 
 
 def crs_of_map(sources: Iterable[str], url: str, asked: str | None) -> str | None:
@@ -287,7 +314,8 @@ def crs_of_map(sources: Iterable[str], url: str, asked: str | None) -> str | Non
         return open_store(url).settings.crs
     except StoreNotFoundError:
         named = [source for source in sources if not is_log(source)]
-        return _with_crs(IngestSettings(crs=asked), _examine_all(named, {})).crs if named else asked
+        settings = IngestSettings(crs=asked)
+        return _with_crs(settings, _examine_all(named, settings, {})).crs if named else asked
 
 
 def plan_ingest(
@@ -304,11 +332,11 @@ def plan_ingest(
     The tasks that write tiles are planned from what the reading finds. Arguments and errors as for
     `ingest`; a source that cannot be opened raises its own error here.
     """
-    found = _examine_all(sources, _log_options(points_topic, pose_topic, scans))
+    found = _examine_all(sources, settings, _log_options(points_topic, pose_topic, scans))
     for source in found:
         if source.reason:
             raise SourceError(source.reason)
-    store = TileStore(str(url), StoreSettings(**_with_crs(settings, found).model_dump()))
+    store = TileStore(str(url), store_settings(_with_crs(settings, found)))
     return Reading(store, found, memory, current=False).scatters
 
 
@@ -320,7 +348,9 @@ def _log_options(
 
 
 def _examine_all(
-    sources: str | os.PathLike[str] | Iterable[str | os.PathLike[str]], log_options: dict[str, Any]
+    sources: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+    settings: IngestSettings,
+    log_options: dict[str, Any],
 ) -> list[Source]:
     """Every file that the sources name, opened as far as its header.
 
@@ -340,7 +370,8 @@ def _examine_all(
             found[pattern] = Source(pattern, state="", reason=str(error))
             continue
         for path in paths:
-            options = log_options if is_log(path) else {}
+            noise = {"keep_noise": True} if settings.keep_noise else {}
+            options = log_options if is_log(path) else noise
             absolute = str(Path(path).absolute())
             found.setdefault(absolute, _examine(absolute, options))
     if not found:
@@ -390,7 +421,7 @@ def _create_or_resume(url: str, settings: IngestSettings, found: Sequence[Source
     Raises:
         UsageError: the store has other settings, or knows a source that was not given.
     """
-    wanted = StoreSettings(**settings.model_dump())
+    wanted = store_settings(settings)
     try:
         store = open_store(url)
     except StoreNotFoundError:

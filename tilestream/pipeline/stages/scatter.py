@@ -5,6 +5,7 @@ workers.
 """
 
 import json
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -22,7 +23,7 @@ from tilestream.marks import hash_of, sealed, unsealed
 from tilestream.pipeline.engine.outputs import Facts, Made
 from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.engine.stage import BASE_BYTES, Counts, Task, stage
-from tilestream.records import Int64
+from tilestream.records import Float64, Int64
 from tilestream.store import TileStore
 
 Int32 = NDArray[np.int32]
@@ -39,8 +40,10 @@ WINDOW = 2**17
 """Tiles that are counted at once: more of them are halved."""
 BYTES_PER_WINDOW_TILE = 40
 """Memory per tile of a window: its count, first row and fingerprint."""
-MAX_WINDOW = 50_000_000
-"""Most tiles that the bounding box of one block may span."""
+WIDE = 50_000_000
+"""Tiles that the bounding box of a block spans if it has strays, or its points are nowhere."""
+MAX_SPREAD = 1000
+"""Windows in which the points of such a block may lie: of strays there are few."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,10 @@ class Grouped:
     """Each tile in their order: key, count, fingerprint."""
     dropped: int
     """Points of the file that were not finite."""
+    left_out: int
+    """Points that the file marks as noise or withheld."""
+    outside: Float64
+    """(m, 3) points that do not fit the tile grid [m]."""
 
 
 @dataclass(frozen=True)
@@ -98,12 +105,18 @@ class Fragment:
     """(ix, iy, start, count) of each run of points of one tile."""
     prints: tuple[tuple[int, int, int, int], ...]
     """(ix, iy, two 64-bit sums): the fingerprint of the points of each tile."""
+    left_out: int = 0
+    """Points that the file marks as noise or withheld."""
+    outside: int = 0
+    """Points that do not fit the tile grid."""
+    outside_at: tuple[float, ...] = ()
+    """The first of those [m]."""
 
     @classmethod
     def of(cls, facts: Facts) -> "Fragment":
         """From the facts of a scatter task."""
         rows = {name: tuple(tuple(row) for row in facts[name]) for name in ("pieces", "prints")}
-        return cls(facts["name"], facts["points"], facts["dropped"], **rows)
+        return cls(**{**facts, **rows, "outside_at": tuple(facts["outside_at"])})
 
 
 @dataclass(frozen=True)
@@ -147,16 +160,21 @@ def fragments_of(store_url: str) -> Files:
 def _written(name: str, groups: Iterable[Grouped], file: Any) -> Fragment:
     pieces: list[tuple[int, int, int, int]] = []
     prints: dict[TileKey, Print] = {}
-    start = dropped = 0
+    start = dropped = left_out = outside = 0
+    outside_at: tuple[float, ...] = ()
     for group in groups:
         dropped += group.dropped
+        left_out += group.left_out
+        if len(group.outside) and not outside:
+            outside_at = tuple(group.outside[0].tolist())
+        outside += len(group.outside)
         file.write(group.points.tobytes())
         for key, count, fingerprint in group.tiles:
             pieces.append((*key, start, count))
             prints[key] = add_prints(prints.get(key, (0, 0)), fingerprint)
             start += count
     of_tiles = tuple((*key, *fingerprint) for key, fingerprint in prints.items())
-    return Fragment(name, start, dropped, tuple(pieces), of_tiles)
+    return Fragment(name, start, dropped, tuple(pieces), of_tiles, left_out, outside, outside_at)
 
 
 def _memory(counts: Counts) -> int:
@@ -164,7 +182,7 @@ def _memory(counts: Counts) -> int:
     return counts["resident_bytes"] + block + WINDOW * BYTES_PER_WINDOW_TILE
 
 
-@stage("scatter", version=1, memory=_memory, seconds=5.5e-8)
+@stage("scatter", version=2, memory=_memory, seconds=5.5e-8)
 def scatter(blocks: Iterator[Block], grid: TileGrid, where: str) -> Iterator[Grouped]:
     """The points of a span of a source, block by block, each sorted by the tile that owns them.
 
@@ -174,14 +192,12 @@ def scatter(blocks: Iterator[Block], grid: TileGrid, where: str) -> Iterator[Gro
         where: which source and span, for messages.
 
     Raises:
-        SourceError: the source cannot be read whole, or a point does not fit the tile grid.
+        SourceError: the source cannot be read whole, or its points are all over the place.
     """
     for block in blocks:
-        if len(block.points):
-            points, tiles = group(to_mm(block.points, where), grid)
-            yield Grouped(points, tiles, block.dropped)
-        elif block.dropped:
-            yield Grouped(np.zeros((0, 3), np.int32), (), block.dropped)
+        points_mm, outside = to_mm(block.points)
+        points, tiles = group(points_mm, grid, where)
+        yield Grouped(points, tiles, block.dropped, block.left_out, outside)
 
 
 def scatter_tasks(
@@ -234,48 +250,43 @@ def add_prints(a: tuple[int, int], b: tuple[int, int]) -> tuple[int, int]:
     return (a[0] + b[0]) % 2**64, (a[1] + b[1]) % 2**64
 
 
-def to_mm(points: NDArray[np.float64], where: str) -> Int64:
-    """Finite points [m] as whole millimetres, half to even.
-
-    Raises:
-        CorruptSourceError: a point does not fit the tile grid; says where and which.
+def to_mm(points: Float64) -> tuple[Int64, Float64]:
+    """Finite points [m] as whole millimetres, half to even; and those that do not fit the tile grid
+    [m], which are not among them.
     """
-    out = np.empty(points.shape, np.int64)
     limits = np.array([MAX_XY_MM, MAX_XY_MM, MAX_Z_MM], dtype=np.float64)
-    bad = kernels.round_to_mm(points, limits, out)
-    if bad >= 0:
-        place = ", ".join(f"{value:.6g}" for value in points[bad])
-        raise CorruptSourceError(
-            f"{where}: a point at ({place}) m does not fit the tile grid "
-            f"(|x|, |y| <= {MAX_XY_MM // MM_PER_M} m, |z| <= {MAX_Z_MM // MM_PER_M} m): "
-            "is the file in metres, and its header right?"
-        )
-    return out
+    out = np.empty(points.shape, np.int64)
+    if kernels.round_to_mm(points, limits, out) < 0:
+        return out, points[:0]
+    fits = (np.abs(np.rint(points * MM_PER_M)) <= limits).all(axis=1)
+    return to_mm(points[fits])[0], points[~fits]
 
 
-def group(points_mm: Int64, grid: TileGrid) -> tuple[Int32, list[tuple[TileKey, int, Print]]]:
+def group(
+    points_mm: Int64, grid: TileGrid, where: str
+) -> tuple[Int32, list[tuple[TileKey, int, Print]]]:
     """Points sorted by the tile that owns them, relative to its origin.
 
     Args:
-        points_mm: (n, 3), n >= 1.
+        points_mm: (n, 3).
         grid: the tiles.
+        where: which source and span, for messages.
 
     Returns:
         The (n, 3) int32 points, and for each tile in their order its key, count and fingerprint.
 
     Raises:
-        CorruptSourceError: the block spans more tiles than any real map.
+        CorruptSourceError: the points are spread over more places than those of any real map.
     """
+    if not len(points_mm):
+        return np.zeros((0, 3), np.int32), []
     tile_mm = grid.tile_mm
     ix_lo, iy_lo, ix_hi, iy_hi = kernels.tile_bounds(points_mm, tile_mm)
     rows, window = iy_hi - iy_lo + 1, (ix_hi - ix_lo + 1) * (iy_hi - iy_lo + 1)
-    if window > MAX_WINDOW:
-        raise CorruptSourceError(
-            f"a block of {len(points_mm):,} points spans {window:,} tiles of "
-            f"{tile_mm / MM_PER_M:g} m: use larger tiles, or remove the stray points"
-        )
+    if window > WIDE:
+        _refuse_spread(points_mm, tile_mm, window, where)
     if window > WINDOW:
-        return _in_halves(points_mm, grid, (ix_lo, iy_lo), (ix_hi, iy_hi))
+        return _in_halves(points_mm, grid, where, (ix_lo, iy_lo), (ix_hi, iy_hi))
     tile_of = np.empty(len(points_mm), np.int32)
     counts = np.zeros(window, np.int64)
     kernels.tile_of_points(points_mm, tile_mm, ix_lo, iy_lo, rows, tile_of, counts)
@@ -292,14 +303,24 @@ def group(points_mm: Int64, grid: TileGrid) -> tuple[Int32, list[tuple[TileKey, 
     return grouped, [(key, count, (a, b)) for key, count, (a, b) in tiles]
 
 
+def _refuse_spread(points_mm: Int64, tile_mm: int, window: int, where: str) -> None:
+    """Refuse points that halving would part forever."""
+    wide = tile_mm * math.isqrt(WINDOW)
+    if len(np.unique(points_mm[:, :2] // wide, axis=0)) > MAX_SPREAD:
+        raise CorruptSourceError(
+            f"{where}: a block of {len(points_mm):,} points spans {window:,} tiles of "
+            f"{tile_mm / MM_PER_M:g} m, all over them: is the file in metres, and its header right?"
+        )
+
+
 def _in_halves(
-    points_mm: Int64, grid: TileGrid, low: tuple[int, int], high: tuple[int, int]
+    points_mm: Int64, grid: TileGrid, where: str, low: tuple[int, int], high: tuple[int, int]
 ) -> tuple[Int32, list[tuple[TileKey, int, Print]]]:
     """As `group`, of few points far apart: the longer side is halved, which most points survive."""
     axis = 0 if high[0] - low[0] >= high[1] - low[1] else 1
     border = (low[axis] + high[axis] + 1) // 2 * grid.tile_mm
     below = points_mm[:, axis] < border
-    halves = [group(points_mm[side], grid) for side in (below, ~below) if side.any()]
+    halves = [group(points_mm[side], grid, where) for side in (below, ~below) if side.any()]
     return np.concatenate([points for points, _ in halves]), [
         t for _, tiles in halves for t in tiles
     ]
