@@ -17,7 +17,7 @@ import pandas as pd
 from fuzz_mutations import Mutate, in_chunks, in_json, in_pages, in_zip, mutated
 from mcap.writer import CompressionType
 from model_data import dataset, drives
-from points import far_points, write_e57, write_map_directory, write_ply
+from points import far_points, write_e57, write_map_directory, write_ply, write_ply_lists
 from test_lanelet2 import osm
 from test_las import laz_of_chunks
 from test_routes import as_csv, as_kitti, as_tum, geojson, line
@@ -249,6 +249,7 @@ READERS = (
     of_points("PLY ascii", "a.ply", ply_text),
     of_points("PLY binary", "a.ply", write_ply),
     of_points("PLY big-endian", "a.ply", ply_big),
+    of_points("PLY with lists", "a.ply", write_ply_lists),
     of_points("E57", "a.e57", write_e57, mutate=in_pages, bombs=bombs.of_e57),
     Reader("Autoware metadata", METADATA, write_map, map_directory, bombs=bombs.of_yaml),
     Reader("Autoware projector", PROJECTOR, write_map, map_directory, bombs=bombs.of_yaml),

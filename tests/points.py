@@ -47,6 +47,20 @@ end_header
 """
 
 
+def write_ply_lists(path: Path, points: np.ndarray) -> None:
+    """A face first, and a list in each vertex."""
+    vertex = np.empty(len(points), [(name, "f8") for name in "xyz"] + [("seen", object)])
+    for axis, name in enumerate("xyz"):
+        vertex[name] = points[:, axis]
+    vertex["seen"] = [np.arange(i % 3, dtype="i4") for i in range(len(points))]
+    face = np.array([((0, 1, 2),)], [("vertex_indices", "i4", (3,))])
+    elements = [
+        plyfile.PlyElement.describe(face, "face"),
+        plyfile.PlyElement.describe(vertex, "vertex", val_types={"seen": "i4"}),
+    ]
+    plyfile.PlyData(elements, byte_order="<").write(str(path))
+
+
 def write_ply(path: Path, points: np.ndarray, byte_order: str = "<", text: bool = False) -> None:
     vertex = plyfile.PlyElement.describe(np.rec.fromarrays(points.T, names="x,y,z"), "vertex")
     plyfile.PlyData([vertex], text=text, byte_order=byte_order).write(str(path))
@@ -122,6 +136,7 @@ CASES = {
     ),
     "ply ascii": Case("a.ply", functools.partial(write_ply, text=True), 0.0),
     "ply little": Case("l.PLY", write_ply, 0.0),
+    "ply lists": Case("v.ply", write_ply_lists, 0.0),
     "ply big": Case("b.ply", functools.partial(write_ply, byte_order=">"), 0.0),
     "las": Case("a.las", write_las, HALF_MM, holds_nan=False),
     "laz": Case("a.laz", write_las, HALF_MM, holds_nan=False),

@@ -137,6 +137,23 @@ def test_a_zero_point_among_utm_coordinates_is_left_out(cases: Path, tmp_path: P
     assert "10 km from all others: 1 of 7,716 points, 1 near (0, 0) m: left out" in notes_of(store)
 
 
+def test_words_of_other_c_libraries_are_not_finite(cases: Path, tmp_path: Path) -> None:
+    words = (cases / "nan_ind.pcd").read_text().split("DATA ascii\n")[1].splitlines()
+    bad = sum("(" in line or "#" in line for line in words)
+    (source,) = made(cases / "nan_ind.pcd", tmp_path).sources()
+    assert (source["points"], source["dropped"]) == (300 - bad, bad)
+    assert bad > 0
+
+
+def test_ply_as_other_programs_write_it(cases: Path, tmp_path: Path) -> None:
+    assert describe(cases / "list_in_vertex.ply").points == 3
+    assert len(points_of(made(cases / "list_in_vertex.ply", tmp_path / "a"))) == 3
+    points = points_of(made(cases / "faces_first.ply", tmp_path / "b"))
+    assert len(points) == STREET
+    np.testing.assert_allclose(points.min(axis=0), LOW, atol=0.001)
+    np.testing.assert_allclose(points.max(axis=0), HIGH, atol=0.001)
+
+
 def test_a_crs_that_cannot_be_read_gives_way_to_what_the_user_says(
     map_cases: Path, tmp_path: Path
 ) -> None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from points import PCD_TEXT, points_of
 
 from tilestream.errors import CorruptSourceError
-from tilestream.formats import open_source
+from tilestream.formats import Span, open_source
 from tilestream.formats.points.pcd import write_pcd
 
 # 40 points of XYZI that PCL 1.13 (pcl::PCDWriter::writeBinaryCompressed) wrote for this test:
@@ -158,3 +158,20 @@ def test_bytes_behind_the_last_point_are_noted(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes() + bytes(5))
     assert open_source(path).info().notes == ("5 bytes behind the last point are ignored",)
     assert np.array_equal(points_of(path), np.ones((3, 3)))
+
+
+@pytest.mark.parametrize(
+    "word",
+    ["-nan(ind)", "nan(snan)", "-nan", "NaN", "1.#INF", "-1.#IND", "1.#QNAN0", "inf", "-1.#INF00"],
+)
+def test_words_for_what_is_not_finite(word: str, tmp_path: Path) -> None:
+    path = written(tmp_path, PCD_TEXT.replace("1 2 3\n", f"1 {word} 3\n"))
+    (block,) = open_source(path).blocks(Span(0, 2), 2)
+    assert (block.points.tolist(), block.dropped) == ([[4.0, 5.0, 6.0]], 1)
+
+
+@pytest.mark.parametrize("word", ["nan(", "1.#", "1.5#INF", "nano"])
+def test_words_that_are_no_numbers_at_all(word: str, tmp_path: Path) -> None:
+    path = written(tmp_path, PCD_TEXT.replace("1 2 3\n", f"1 {word} 3\n"))
+    with pytest.raises(CorruptSourceError, match="point 0 is"):
+        list(open_source(path).blocks(Span(0, 2), 2))

@@ -1,6 +1,7 @@
 """Points that lie row by row in a file, binary or as text, and what reading them has in common."""
 
 import math
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,6 +19,8 @@ from tilestream.records import Float64
 
 _LINE_MAX = 1 << 16
 """Longest line of text that is read as one row [bytes]."""
+_NOT_FINITE = re.compile(rb"[-+]?(?:1\.#[A-Za-z0-9]+|nan\([^()\s]*\))", re.IGNORECASE)
+"""Words for numbers that are not finite as other C libraries write them: -nan(ind), 1.#INF."""
 _FLOAT32_LOSS = 1e-4
 """Largest rounding that a writer accepts before it chooses float64 [m]."""
 
@@ -267,6 +270,8 @@ class TextRows:
     """Which words are x, y and z."""
     more_follows: bool = False
     """Whether something else may come behind the last row."""
+    skipped: int = 0
+    """Rows of something else before the first one."""
 
     def spans(self, points: int) -> list[Span]:
         """One: text is read from its beginning."""
@@ -294,7 +299,7 @@ class TextRows:
         with Path(self.path).open("rb") as file:
             file.seek(self.offset)
             lines = (line for line in iter(partial(file.readline, _LINE_MAX), b"") if line.strip())
-            for _ in islice(lines, span.start):
+            for _ in islice(lines, self.skipped + span.start):
                 pass
             for step in steps(span, block_points):
                 rows = list(islice(lines, step.stop - step.start))
@@ -318,10 +323,11 @@ class TextRows:
             )
 
     def _numbers(self, rows: list[bytes], step: Span) -> Float64:
-        try:
-            table = np.loadtxt(rows, dtype=np.float64, comments=None, ndmin=2)
-        except (ValueError, OverflowError):
-            table = np.empty((0, 0))
+        rows = [self.numbers_of(row) for row in rows]
+        table = _table(rows)
+        if table.shape != (len(rows), self.words):
+            rows = [_NOT_FINITE.sub(b"nan", row) for row in rows]
+            table = _table(rows)
         if table.shape != (len(rows), self.words):
             row = next((i for i, row in enumerate(rows) if not self._is_row(row)), 0)
             raise CorruptSourceError(
@@ -329,6 +335,10 @@ class TextRows:
                 "numbers: the file is damaged or its header is wrong"
             )
         return table
+
+    def numbers_of(self, row: bytes) -> bytes:
+        """The words of a row that are read: all."""
+        return row
 
     def _is_row(self, line: bytes) -> bool:
         try:
@@ -342,6 +352,14 @@ class TextRows:
                 f"{self.path}: more rows than the {self.count} points that its header claims, "
                 f"the next one is {line[:60]!r}"
             )
+
+
+def _table(rows: list[bytes]) -> Float64:
+    """Rows of numbers; an empty table where they are none, or of different length."""
+    try:
+        return np.loadtxt(rows, dtype=np.float64, comments=None, ndmin=2)
+    except (ValueError, OverflowError):
+        return np.empty((0, 0))
 
 
 def as_points(points: ArrayLike) -> Float64:
