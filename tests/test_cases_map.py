@@ -154,6 +154,12 @@ def test_ply_as_other_programs_write_it(cases: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(points.max(axis=0), HIGH, atol=0.001)
 
 
+def test_fill_values_of_a_log_are_left_out_of_its_map(shared_cases: Path, tmp_path: Path) -> None:
+    store = made(shared_cases / "log" / "fill_values_1e9.mcap", tmp_path)
+    assert "outside of the tile grid: 600 of 26,382 points, first (1e+09, " in notes_of(store)
+    assert np.abs(points_of(store)).max() < 100.0
+
+
 def test_a_crs_that_cannot_be_read_gives_way_to_what_the_user_says(
     map_cases: Path, tmp_path: Path
 ) -> None:

@@ -23,7 +23,9 @@ less than twice."""
 TOO_FAR = 1_000_000.0
 """How far apart the parts of a source may be [m]: no projection in metres reaches further."""
 FEW, FEW_SHARE = 10, 0.01
-"""Strays are left out where they are at most so many, or at most this share of all points."""
+"""Points far away are left out where they are at most so many, or at most this share of all …"""
+OUTSIDE_SHARE = 0.1
+"""… and those outside of the tile grid, which no map has, up to this share."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,7 @@ def without_strays(path: str, fragments: Sequence[Fragment], grid: TileGrid) -> 
         lost = sum(fragment.outside for fragment in outside)
         place = ", ".join(f"{value:.6g}" for value in outside[0].outside_at)
         told = f"outside of the tile grid: {lost:,} of {points + lost:,} points, first ({place}) m"
-        if not _are_few(lost, points + lost):
+        if not _are_few(lost, points + lost, OUTSIDE_SHARE):
             raise CorruptSourceError(f"{path}: {told}: is it in metres, and its header right?")
         notes.append(f"{told}: left out")
     strays, places = _strays(counts, grid)
@@ -72,8 +74,8 @@ def without_strays(path: str, fragments: Sequence[Fragment], grid: TileGrid) -> 
     return Kept(tuple(fragments), points, tuple(notes))
 
 
-def _are_few(strays: int, points: int) -> bool:
-    return 2 * strays < points and strays <= max(FEW, FEW_SHARE * points)
+def _are_few(strays: int, points: int, share: float = FEW_SHARE) -> bool:
+    return 2 * strays < points and strays <= max(FEW, share * points)
 
 
 def _strays(counts: Counter[tuple[int, int]], grid: TileGrid) -> tuple[set[tuple[int, int]], str]:
