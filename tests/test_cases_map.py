@@ -17,7 +17,7 @@ from tilestream.errors import CrsError, PartialError, SourceNotFoundError
 from tilestream.formats import describe
 from tilestream.formats.points.las import write_las
 from tilestream.formats.points.pcd import write_pcd
-from tilestream.formats.routes import read_route
+from tilestream.formats.routes import read_all_routes, read_route
 
 STREET = 7715
 """Points of the made street: 40 m, its lowest corner at (-0.027, -9.561, -0.068) m."""
@@ -78,28 +78,28 @@ def test_a_crs_with_heights_is_the_same_map(map_cases: Path, tmp_path: Path) -> 
     assert "EGM2008 height" in notes_of(store)
 
 
-def test_all_points_of_a_legacy_count(cases: Path, tmp_path: Path) -> None:
-    assert describe(cases / "las14_legacy_count_only.las").points == STREET
-    assert len(points_of(made(cases / "las14_legacy_count_only.las", tmp_path))) == STREET
+def test_all_points_of_a_legacy_count(map_cases: Path, tmp_path: Path) -> None:
+    assert describe(map_cases / "las14_legacy_count_only.las").points == STREET
+    assert len(points_of(made(map_cases / "las14_legacy_count_only.las", tmp_path))) == STREET
 
 
 @pytest.mark.parametrize("name", ["nan_bounds.las", "zero_bounds.las"])
 def test_impossible_bounds_are_read_from_the_points(
-    name: str, cases: Path, capsys: pytest.CaptureFixture[str]
+    name: str, map_cases: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(["info", str(cases / name), "--json"]) == 0
+    assert run(["info", str(map_cases / name), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     np.testing.assert_allclose(found["bounds"], [LOW, HIGH], atol=1e-9)
     assert any("the bounds in its header" in note for note in found["notes"])
 
 
 def test_a_plan_does_not_believe_impossible_bounds(
-    cases: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    map_cases: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "way.csv").write_text("x,y,z\n5,0,0\n35,0,0\n")
     job = {
         "out": str(tmp_path / "job"),
-        "map": {"sources": [str(cases / "zero_bounds.las")], "tile_size": 10.0},
+        "map": {"sources": [str(map_cases / "zero_bounds.las")], "tile_size": 10.0},
         "routes": [str(tmp_path / "way.csv")],
         "model": {"recipe": "physics"},
         "observe": {},
@@ -110,9 +110,9 @@ def test_a_plan_does_not_believe_impossible_bounds(
 
 
 def test_noise_and_withheld_points_are_left_out(
-    cases: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    map_cases: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    file, url = cases / "noise_and_withheld.laz", str(tmp_path / "map.zarr")
+    file, url = map_cases / "noise_and_withheld.laz", str(tmp_path / "map.zarr")
     asked = ["ingest", str(file), "--store", url, "--map-leaf", "0"]
     assert run(asked) == 0
     assert points_of(ts.open_store(url))[:, 2].max() < 10.0
@@ -128,8 +128,8 @@ def test_noise_and_withheld_points_are_left_out(
     assert len(points_of(ts.open_store(url))) == STREET - bad.sum()
 
 
-def test_a_zero_point_among_utm_coordinates_is_left_out(cases: Path, tmp_path: Path) -> None:
-    store = made(cases / "utm_with_zero_point.pcd", tmp_path)
+def test_a_zero_point_among_utm_coordinates_is_left_out(map_cases: Path, tmp_path: Path) -> None:
+    store = made(map_cases / "utm_with_zero_point.pcd", tmp_path)
     assert len(points_of(store)) == STREET
     assert np.ptp(points_of(store), axis=0).max() < 50.0
     (source,) = store.sources()
@@ -137,25 +137,25 @@ def test_a_zero_point_among_utm_coordinates_is_left_out(cases: Path, tmp_path: P
     assert "10 km from all others: 1 of 7,716 points, 1 near (0, 0) m: left out" in notes_of(store)
 
 
-def test_words_of_other_c_libraries_are_not_finite(cases: Path, tmp_path: Path) -> None:
-    words = (cases / "nan_ind.pcd").read_text().split("DATA ascii\n")[1].splitlines()
+def test_words_of_other_c_libraries_are_not_finite(map_cases: Path, tmp_path: Path) -> None:
+    words = (map_cases / "nan_ind.pcd").read_text().split("DATA ascii\n")[1].splitlines()
     bad = sum("(" in line or "#" in line for line in words)
-    (source,) = made(cases / "nan_ind.pcd", tmp_path).sources()
+    (source,) = made(map_cases / "nan_ind.pcd", tmp_path).sources()
     assert (source["points"], source["dropped"]) == (300 - bad, bad)
     assert bad > 0
 
 
-def test_ply_as_other_programs_write_it(cases: Path, tmp_path: Path) -> None:
-    assert describe(cases / "list_in_vertex.ply").points == 3
-    assert len(points_of(made(cases / "list_in_vertex.ply", tmp_path / "a"))) == 3
-    points = points_of(made(cases / "faces_first.ply", tmp_path / "b"))
+def test_ply_as_other_programs_write_it(map_cases: Path, tmp_path: Path) -> None:
+    assert describe(map_cases / "list_in_vertex.ply").points == 3
+    assert len(points_of(made(map_cases / "list_in_vertex.ply", tmp_path / "a"))) == 3
+    points = points_of(made(map_cases / "faces_first.ply", tmp_path / "b"))
     assert len(points) == STREET
     np.testing.assert_allclose(points.min(axis=0), LOW, atol=0.001)
     np.testing.assert_allclose(points.max(axis=0), HIGH, atol=0.001)
 
 
-def test_fill_values_of_a_log_are_left_out_of_its_map(shared_cases: Path, tmp_path: Path) -> None:
-    store = made(shared_cases / "log" / "fill_values_1e9.mcap", tmp_path)
+def test_fill_values_of_a_log_are_left_out_of_its_map(cases: Path, tmp_path: Path) -> None:
+    store = made(cases / "log" / "fill_values_1e9.mcap", tmp_path)
     assert "outside of the tile grid: 600 of 26,382 points, first (1e+09, " in notes_of(store)
     assert np.abs(points_of(store)).max() < 100.0
 
@@ -193,7 +193,11 @@ def test_the_map_s_own_projector_serves_its_lanes(
     lanes.write_text(re.sub(r"lat='(\S+)' lon='(\S+)'", moved, lanes.read_text()))
     asked = ["--route", str(lanes), "--out", str(tmp_path / "run"), "--json"]
     assert run(["factors", store.url, *asked]) == 0
-    assert json.loads(capsys.readouterr().out) == {"sample_points": 31, "done": 31}
+    assert json.loads(capsys.readouterr().out) == {
+        "sample_points": 31,
+        "done": 31,
+        "notes": [],
+    }
     assert planned(folder, tmp_path) == 0
     assert "1 lanes of" in " ".join(capsys.readouterr().out.split())
 
@@ -239,7 +243,7 @@ def test_a_route_in_another_zone_is_projected(
     expected = np.column_stack(to_map.transform(*alone.positions[:, :2].T))
     np.testing.assert_allclose(route.positions[:, :2], expected, atol=1e-6)
     assert route.crs == "EPSG:6677"
-    assert "projected from EPSG:6676" in route.notes[0]
+    assert "projected from EPSG:6676" in read_all_routes(file, map_crs="EPSG:6677").notes[0]
     store = ts.ingest(cases / "street.pcd", tmp_path / "map.zarr", crs="EPSG:6677")
     with pytest.raises(CrsError, match=r"EPSG:6676 and .*EPSG:6677"):
         ts.factors_along(store, [alone], tmp_path / "run")

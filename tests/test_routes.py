@@ -302,7 +302,7 @@ def test_degrees_that_are_none_are_refused_with_what_they_look_like(tmp_path: Pa
     with pytest.raises(CrsError, match="look like metres"):
         read_route(path)
     path.write_text("lat,lon\n0,48\n0,49.8\n")
-    with pytest.raises(CrsError, match="EPSG:6677 cannot hold its places"):
+    with pytest.raises(CrsError, match="is nowhere in EPSG:6677"):
         read_route(path, project_to="EPSG:6677")
 
 

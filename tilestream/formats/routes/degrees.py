@@ -44,13 +44,14 @@ def metric(
     target = _target(path, project_to, map_crs)
     system = None if crs is None else parsed(crs, path)
     degrees = system.is_geographic if system is not None else _look_like_degrees(points, drawn)
+    if degrees:
+        _check_on_earth(path, points)
     if degrees and target is None:
         raise CrsError(
             f"{path}: coordinates in degrees, not metres (or a path of less than a metre); project "
             "them to the map's CRS first, or name it as project_to"
         )
     if degrees and target is not None:
-        _check_on_earth(path, points)
         return _projected(path, points, crs or "EPSG:4326", target), target, ()
     if crs is None:
         if project_to is not None:
