@@ -241,7 +241,11 @@ def test_the_command(
     assert run([*command, "--spacing", "6", "--dry-run"]) == 0
     assert "terms" in capsys.readouterr().out
     assert run([*command, "--spacing", "6", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {"sample_points": 9, "done": 9}
+    assert json.loads(capsys.readouterr().out) == {
+        "sample_points": 9,
+        "done": 9,
+        "notes": [],
+    }
     assert run([*command, "--spacing", "6"]) == 0
     assert "feature_count" in capsys.readouterr().out
     assert run([*command, "--sensor", "VLP17"]) == 2

@@ -144,13 +144,13 @@ def _take(lock: Files, me: Holder) -> Holder | None:
                 return there
             lock.write(me.content())
         return None
-    try:
+    there = Holder.of(lock.parent.read_all([LOCK])[0])
+    if there is not None and there.lives:
+        return there
+    lock.remove()
+    try:  # of two that come here at once, one makes it, where the store knows conditional writes
         lock.fs.pipe_file(lock.root, me.content(), mode="create")
     except FileExistsError:
-        there = Holder.of(lock.read())
-        if there is not None and there.lives:
-            return there
-        lock.remove()
         return _take(lock, me)
     return None
 

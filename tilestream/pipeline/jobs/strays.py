@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from tilestream.errors import CorruptSourceError
 from tilestream.grid import TileGrid
+from tilestream.kernels.fixed_order import norms
 from tilestream.pipeline.stages.scatter import Fragment
 from tilestream.records import Int64
 
@@ -90,7 +91,7 @@ def _strays(counts: Counter[tuple[int, int]], grid: TileGrid) -> tuple[set[tuple
     corners = tiles * grid.tile_mm / 1000.0
     centre = corners[part == main].mean(axis=0)
     first = [int(np.argmax(part == i)) for i in range(len(size))]
-    away = np.linalg.norm(corners[first] - centre, axis=1)
+    away = norms(corners[first] - centre)
     few = [_are_few(int(n), int(points.sum())) for n in size]
     lost = [i for i in range(len(size)) if i != main and (few[i] or away[i] > TOO_FAR)]
     places = ", ".join(f"{size[i]:,} near {_place(corners[first[i]])} m" for i in lost[:3])
