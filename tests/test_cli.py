@@ -236,6 +236,31 @@ def test_a_run_that_is_terminated_says_so_and_takes_its_workers_along(
     assert not psutil.wait_procs(workers, timeout=PATIENCE)[1]
 
 
+def test_a_request_to_end_is_heard_while_errors_are_ignored() -> None:
+    """An error raised in a callback of the garbage collector is ignored by Python."""
+    script = """
+import gc, os, signal, sys, time
+from tilestream.cli import app
+
+def asked(phase, info):
+    gc.callbacks.remove(asked)
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(0.01)
+    raise AssertionError("the request is heard before this line")
+
+def command(arguments):
+    gc.callbacks.append(asked)
+    gc.collect()
+    time.sleep(60)
+
+app.app = lambda args, prog_name: command(args)
+app.main()
+"""
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert ended.returncode == 143
+    assert ended.stderr.strip() == "stopped; the same command continues where it was"
+
+
 def test_a_full_disk_is_told_in_one_line(
     pcd: Path, monkeypatch: pytest.MonkeyPatch, capsys: Told
 ) -> None:

@@ -8,6 +8,7 @@ import errno
 import logging
 import signal
 import sys
+import threading
 from importlib import import_module
 from typing import Annotated, Any
 
@@ -89,9 +90,7 @@ class LateCommands(TyperGroup):
         try:
             return super().invoke(ctx)
         except Exception as error:
-            if hasattr(
-                error, "format_message"
-            ):  # it may name any file, as `tilestream info *` does
+            if hasattr(error, "format_message"):  # it may name any file, as `info *` does
                 error.message = visible(error.message)  # type: ignore[attr-defined]
             raise
 
@@ -149,9 +148,30 @@ def _terminate(*_: object) -> None:
     raise Terminated(TERMINATED)
 
 
+class LostRequests:
+    """Asks once more for the end where the request came while Python ignores errors.
+
+    That is so in callbacks of the garbage collector, Dask has one, and in `__del__`. What fails
+    there from then on is a consequence, and is not told.
+    """
+
+    def __init__(self) -> None:
+        self.any = False
+
+    def __call__(self, ignored: Any) -> None:
+        """What `sys.unraisablehook` calls."""
+        if isinstance(ignored.exc_value, Terminated):
+            self.any = True
+            here = threading.main_thread().ident
+            threading.Timer(0.05, signal.pthread_kill, (here, signal.SIGTERM)).start()
+        elif not self.any:
+            sys.__unraisablehook__(ignored)
+
+
 def main() -> None:
     """The entry point: run a command, turn errors into one clear line and an exit code."""
     signal.signal(signal.SIGTERM, _terminate)
+    sys.unraisablehook = LostRequests()
     sys.exit(run(sys.argv[1:]))
 
 
