@@ -10,6 +10,7 @@ import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from patience import wait_until
@@ -145,3 +146,34 @@ def test_an_object_store_has_one_writer(s3_bucket: str) -> None:
     forged(url, host="elsewhere", renewed=0.0)
     with only_writer(url):
         assert writer_of(url).host == socket.gethostname()
+
+
+def test_of_two_that_take_over_an_old_lock_one_gives_way(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In an object store both may have removed the old one: the later lock holds."""
+    url = f"memory://lock-{tmp_path.name}"
+    forged(url, host="elsewhere", renewed=0.0)
+    meanwhile = SimpleNamespace(time=time.time, sleep=lambda _: forged(url, host="another"))
+    monkeypatch.setattr(lock, "time", meanwhile)
+    with pytest.raises(LockedError, match="on another"), only_writer(url):
+        pass
+    assert writer_of(url).host == "another"
+
+
+def test_a_lock_that_was_just_made_is_not_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another process makes it between the look and the write."""
+    url = f"memory://lock-{tmp_path.name}"
+    look = Files.read_all
+
+    def slow(folder: Files, names: list[str]) -> list[bytes | None]:
+        found = look(folder, names)
+        monkeypatch.setattr(Files, "read_all", look)
+        forged(url, host="another")
+        return found
+
+    monkeypatch.setattr(Files, "read_all", slow)
+    with pytest.raises(LockedError, match="on another"), only_writer(url):
+        pass

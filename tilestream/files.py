@@ -49,11 +49,6 @@ class Files:
         return type(self)(self.fs, f"{self.root}/{name}") if name else self
 
     @property
-    def name(self) -> str:
-        """Its last part."""
-        return self.root.rsplit("/", 1)[-1]
-
-    @property
     def parent(self) -> Self:
         """The folder that it lies in."""
         return type(self)(self.fs, self.root.rsplit("/", 1)[0])

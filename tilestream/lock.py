@@ -26,6 +26,8 @@ RENEWED_EVERY = 15.0
 """How often a lock is renewed [s]."""
 STALE_AFTER = 60.0
 """A lock that nobody has renewed for so long is free [s]."""
+SETTLED_AFTER = 2.0
+"""How long two that take over the same lock of an object store may be apart [s]."""
 
 
 @dataclass(frozen=True)
@@ -144,14 +146,31 @@ def _take(lock: Files, me: Holder) -> Holder | None:
                 return there
             lock.write(me.content())
         return None
-    there = Holder.of(lock.parent.read_all([LOCK])[0])
+    return _take_object(lock, me)
+
+
+def _take_object(lock: Files, me: Holder) -> Holder | None:
+    """As `_take`, in an object store: of two that come at once, one makes the lock, where the store
+    knows conditional writes.
+    """
+    (content,) = lock.parent.read_all([LOCK])
+    there = Holder.of(content)
     if there is not None and there.lives:
         return there
-    lock.remove()
-    try:  # of two that come here at once, one makes it, where the store knows conditional writes
+    if content is not None:
+        lock.remove()
+    try:
         lock.fs.pipe_file(lock.root, me.content(), mode="create")
     except FileExistsError:
-        return _take(lock, me)
+        return _take_object(lock, me)
+    if content is not None:  # another may have found the same old lock, and removed this new one
+        time.sleep(SETTLED_AFTER)
+        there = Holder.of(lock.parent.read_all([LOCK])[0])
+        return (
+            None
+            if there is not None and there.token == me.token
+            else there or _take_object(lock, me)
+        )
     return None
 
 
