@@ -82,24 +82,25 @@ def _each_kernel_is_compiled_once(tmp_path_factory: pytest.TempPathFactory) -> N
     numba.Dispatcher.compile = compiled
 
 
+def shared(name: str, variable: str, what: str) -> Path:
+    """A folder beside the project's; who asks for it is skipped where it is absent."""
+    default = Path(__file__).resolve().parents[2] / "shared" / name
+    folder = Path(os.environ.get(variable, default))
+    if not folder.is_dir():
+        pytest.skip(f"no {what} at {folder}: set {variable} to their folder")
+    return folder
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """The folder of real recordings; tests that ask for it are skipped where it is absent."""
-    default = Path(__file__).resolve().parents[2] / "shared" / "data"
-    folder = Path(os.environ.get("TILESTREAM_DATA", default))
-    if not folder.is_dir():
-        pytest.skip(f"no real recordings at {folder}: set TILESTREAM_DATA to their folder")
-    return folder
+    """The folder of real recordings."""
+    return shared("data", "TILESTREAM_DATA", "real recordings")
 
 
 @pytest.fixture(scope="session")
 def cases() -> Path:
-    """The folder of small inputs that went wrong; tests that ask for it are skipped without it."""
-    default = Path(__file__).resolve().parents[2] / "shared" / "cases"
-    folder = Path(os.environ.get("TILESTREAM_CASES", default))
-    if not folder.is_dir():
-        pytest.skip(f"no cases at {folder}: set TILESTREAM_CASES to their folder")
-    return folder
+    """The folder of small inputs that went wrong."""
+    return shared("cases", "TILESTREAM_CASES", "small inputs")
 
 
 @pytest.fixture(scope="session")

@@ -52,7 +52,9 @@ def metric(
             "them to the map's CRS first, or name it as project_to"
         )
     if degrees and target is not None:
-        return _projected(path, points, crs or "EPSG:4326", target), target, ()
+        told = "degrees" if crs else "degrees, as which its numbers look,"
+        note = f"brought from {told} to {named(target)}"
+        return _projected(path, points, crs or "EPSG:4326", target), target, (note,)
     if crs is None:
         if project_to is not None:
             raise CrsError(f"{path}: is not in degrees, so it cannot be projected to {project_to}")
