@@ -31,12 +31,12 @@ from tilestream.formats.points.rows import (
     Flag,
     RowSource,
     Scaling,
-    as_points,
     finite_block,
     flagged,
     steps,
     whole_span,
 )
+from tilestream.formats.points.written import as_points
 from tilestream.formats.registry import Format
 from tilestream.records import Float64
 

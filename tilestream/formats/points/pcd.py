@@ -24,15 +24,13 @@ from tilestream.formats.points.rows import (
     Columns,
     RowSource,
     TextRows,
-    as_points,
-    as_text,
     columns_of,
     even_spans,
     finite_block,
     steps,
-    table_of,
     whole_span,
 )
+from tilestream.formats.points.written import as_points, as_text, table_of
 from tilestream.formats.projector import crs_beside
 from tilestream.formats.registry import Format
 from tilestream.kernels import lzf
