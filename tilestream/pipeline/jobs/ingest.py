@@ -2,69 +2,46 @@
 
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, fields, replace
-from pathlib import Path
+from dataclasses import asdict, fields, replace
 from typing import Any
 
-from tilestream.crs import one_crs, same
+from tilestream.crs import same
 from tilestream.errors import (
     CorruptSourceError,
     PartialError,
     SourceError,
-    SourceNotFoundError,
     StoreNotFoundError,
     UsageError,
 )
-from tilestream.formats import expand_sources, open_source
-from tilestream.formats.base import SourceInfo, Span
-from tilestream.formats.logs import ScanSelection, is_log
-from tilestream.formats.registry import state_of
+from tilestream.formats.logs import ScanSelection
 from tilestream.lock import only_writer
-from tilestream.marks import hash_of
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.outputs import TileArrays
-from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, megabytes
+from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan
 from tilestream.pipeline.engine.stage import Task
-from tilestream.pipeline.jobs.strays import Kept, without_strays
+from tilestream.pipeline.jobs.sources import (
+    Source,
+    as_read,
+    examine_all,
+    log_options,
+    with_crs,
+    within,
+)
+from tilestream.pipeline.jobs.strays import without_strays
 from tilestream.pipeline.stages.merge import merge, merge_tasks
 from tilestream.pipeline.stages.scatter import (
     Fragment,
     SourceSpan,
     fragments_of,
-    needed_to_open,
     scatter,
     scatter_tasks,
 )
 from tilestream.settings import IngestSettings
 from tilestream.store import Manifest, StoreSettings, TileStore, open_store
 
-POINTS_PER_TASK = 4_000_000
-"""Points of a source that one scatter task reads: seconds of work, not milliseconds."""
 MADE_BY = {stage.name: stage.version for stage in (scatter, merge)}
 """What a map is made by: another version makes it anew."""
-
-
-@dataclass(frozen=True)
-class Source:
-    """One input of an ingest, and what became of it."""
-
-    path: str
-    """The file, absolute, since workers may run elsewhere."""
-    state: str
-    """Hash of its size, time of change and way of reading: whether it is still the same."""
-    info: SourceInfo | None = None
-    """What is in it; None where it could not be opened."""
-    spans: tuple[Span, ...] = ()
-    """The pieces in which it is read."""
-    options: tuple[tuple[str, Any], ...] = ()
-    """How it is read: topics and scans of a log."""
-    points: int = 0
-    """Finite points that were read."""
-    dropped: int = 0
-    """Points that were not finite."""
-    reason: str = ""
-    """Why it failed; empty where it did not."""
 
 
 def ingest(
@@ -195,7 +172,7 @@ class Reading:
                 except CorruptSourceError as error:
                     self.found[number] = replace(source, reason=str(error))
                     continue
-                self.found[number] = _as_read(source, indices, kept)
+                self.found[number] = as_read(source, indices, kept)
                 fragments += kept.fragments
         fragments.sort(key=lambda fragment: [int(part) for part in fragment.name.split("-")])
         self.merges = merge_tasks(self.store, fragments, self._memory).tasks
@@ -265,19 +242,6 @@ class Reading:
         )
 
 
-def _as_read(source: Source, indices: Sequence[Fragment], kept: Kept) -> Source:
-    """A source with what was read of it, and what was left out."""
-    left_out = sum(index.left_out for index in indices)
-    notes = kept.notes
-    if left_out:
-        told = "points of a class of noise (7 or 18) or withheld are left out"
-        notes += (f"{left_out:,} {told}; --keep-noise keeps them",)
-    assert source.info is not None
-    info = replace(source.info, notes=(*source.info.notes, *notes))
-    dropped = sum(index.dropped for index in indices)
-    return replace(source, info=info, points=kept.points, dropped=dropped)
-
-
 def read_sources(
     sources: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
     url: str | os.PathLike[str],
@@ -288,34 +252,15 @@ def read_sources(
     scans: ScanSelection | None = None,
 ) -> Reading:
     """What `ingest` begins with; arguments and errors as there."""
-    options = _log_options(points_topic, pose_topic, scans)
-    found = _within(_examine_all(sources, settings, options), memory)
-    store = _create_or_resume(str(url), _with_crs(settings, found), found)
+    options = log_options(points_topic, pose_topic, scans)
+    found = within(examine_all(sources, settings, options), memory)
+    store = _create_or_resume(str(url), with_crs(settings, found), found)
     return Reading(store, found, memory, _is_current(store, found))
 
 
 def store_settings(settings: IngestSettings) -> StoreSettings:
     """What of the settings a store is: the rest is how its sources are read."""
     return StoreSettings(**settings.model_dump(include={f.name for f in fields(StoreSettings)}))
-
-
-def crs_of_map(sources: Iterable[str], url: str, asked: str | None) -> str | None:
-    """The CRS that a map has, or will have by the headers of its sources; None: a local frame.
-
-    Args:
-        sources: what it is made from; none: it is there.
-        url: where it is or will be.
-        asked: the CRS that is asked for; None: none is.
-
-    Raises:
-        SourceError, CrsError: as `ingest`.
-    """
-    try:
-        return open_store(url).settings.crs
-    except StoreNotFoundError:
-        named = [source for source in sources if not is_log(source)]
-        settings = IngestSettings(crs=asked)
-        return _with_crs(settings, _examine_all(named, settings, {})).crs if named else asked
 
 
 def plan_ingest(
@@ -332,87 +277,12 @@ def plan_ingest(
     The tasks that write tiles are planned from what the reading finds. Arguments and errors as for
     `ingest`; a source that cannot be opened raises its own error here.
     """
-    found = _examine_all(sources, settings, _log_options(points_topic, pose_topic, scans))
+    found = examine_all(sources, settings, log_options(points_topic, pose_topic, scans))
     for source in found:
         if source.reason:
             raise SourceError(source.reason)
-    store = TileStore(str(url), store_settings(_with_crs(settings, found)))
+    store = TileStore(str(url), store_settings(with_crs(settings, found)))
     return Reading(store, found, memory, current=False).scatters
-
-
-def _log_options(
-    points_topic: str | None, pose_topic: str | None, scans: ScanSelection | None
-) -> dict[str, Any]:
-    wanted = {"points_topic": points_topic, "pose_topic": pose_topic, "scans": scans}
-    return {name: value for name, value in wanted.items() if value is not None}
-
-
-def _examine_all(
-    sources: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
-    settings: IngestSettings,
-    log_options: dict[str, Any],
-) -> list[Source]:
-    """Every file that the sources name, opened as far as its header.
-
-    Raises:
-        UsageError: there are no sources.
-        SourceNotFoundError: a path or glob that matches nothing.
-    """
-    if isinstance(sources, str | os.PathLike):
-        sources = [sources]
-    found: dict[str, Source] = {}
-    for pattern in [os.fspath(source) for source in sources]:
-        try:
-            paths = expand_sources(pattern)
-        except SourceNotFoundError:
-            raise
-        except SourceError as error:
-            found[pattern] = Source(pattern, state="", reason=str(error))
-            continue
-        for path in paths:
-            noise = {"keep_noise": True} if settings.keep_noise else {}
-            options = log_options if is_log(path) else noise
-            absolute = str(Path(path).absolute())
-            found.setdefault(absolute, _examine(absolute, options))
-    if not found:
-        raise UsageError("no sources: name at least one file, glob or map directory")
-    return [found[path] for path in sorted(found)]
-
-
-def _examine(path: str, options: dict[str, Any]) -> Source:
-    """Open a source as far as its header; a failure is its reason, not an exception."""
-    readable = tuple(sorted(options.items()))
-    known = Source(path, hash_of(*state_of(path), repr(readable)), options=readable)
-    try:
-        source = open_source(path, **options)
-        info = source.info()
-        spans = tuple(source.spans(POINTS_PER_TASK))
-    except (SourceError, OSError) as error:
-        return replace(known, reason=str(error))
-    return replace(known, info=info, spans=spans)
-
-
-def _within(found: Sequence[Source], memory: int) -> list[Source]:
-    """The sources; one that needs more memory than a task may use says so, if others do not.
-
-    Where none fits, planning refuses the job as a whole.
-    """
-    needed = {s.path: needed_to_open(s.info) for s in found if s.info is not None}
-    if all(need > memory for need in needed.values()):
-        return list(found)
-    told = "needs {} to be opened and may use {}: allow more with --memory"
-    return [
-        replace(s, info=None, reason=told.format(megabytes(needed[s.path]), megabytes(memory)))
-        if needed.get(s.path, 0) > memory
-        else s
-        for s in found
-    ]
-
-
-def _with_crs(settings: IngestSettings, found: Sequence[Source]) -> IngestSettings:
-    """The settings with the one CRS of the map."""
-    named = [(source.path, source.info.crs) for source in found if source.info is not None]
-    return settings.model_copy(update={"crs": one_crs(settings.crs, named)})
 
 
 def _create_or_resume(url: str, settings: IngestSettings, found: Sequence[Source]) -> TileStore:

@@ -13,9 +13,10 @@ from tilestream.model.dataset import made_with
 from tilestream.model.file import load_model
 from tilestream.model.training import check_making
 from tilestream.pipeline.engine.executor import Watch
-from tilestream.pipeline.jobs.ingest import Reading, crs_of_map, read_sources
+from tilestream.pipeline.jobs.ingest import Reading, read_sources
 from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.jobs.simulate import simulate
+from tilestream.pipeline.jobs.sources import crs_of_map
 from tilestream.pipeline.stages.drive_scans import Reading as DriveReading
 from tilestream.pipeline.stages.observe import Observing
 from tilestream.pipeline.stages.samples import COLUMNS
