@@ -93,7 +93,9 @@ def test_a_lost_tile_is_missed_and_made_again(
 ) -> None:
     key = store.keys()[3]
     shutil.rmtree(f"{store.url}/{key}")
-    assert set(store.condition().lost) == {key}
+    (lost,) = store.condition().lost.items()
+    assert lost[0] == key
+    assert lost[1].facts["read"] > 0
     assert str(key) in str(store.condition())
     assert run(["status", store.url]) == 1
     with pytest.raises(IncompleteError, match=str(key)):
@@ -325,6 +327,34 @@ def test_verify_lists_what_is_damaged_and_repair_lets_the_same_command_make_it_a
     assert f"{second}/points" in told
     assert run(["verify", store.url, "--repair"]) == 0
     assert set(store.condition().lost) == {first, second}
+    ts.ingest(cloud, store.url, tile_size=10.0)
+    assert tree(Path(store.url)) == tree(reference)
+
+
+@pytest.mark.parametrize("file", ["{key}/zarr.json", "{manifest}/c/0", "{manifest}/zarr.json"])
+def test_what_a_map_is_found_by_is_verified_and_made_again(
+    cloud: Path, reference: Path, store: ts.TileStore, file: str
+) -> None:
+    (manifest,) = Path(store.url).glob("manifest_*")
+    path = Path(store.url) / file.format(key=store.keys()[0], manifest=manifest.name)
+    path.write_bytes(flipped(path.read_bytes(), 8 * (path.stat().st_size // 2)))
+    ts.store.manifest.read_manifest.cache_clear()
+    removed, left = repair(store.url)
+    assert len(removed) == 1
+    assert left == []
+    ts.ingest(cloud, store.url, tile_size=10.0)
+    assert tree(Path(store.url)) == tree(reference)
+
+
+def test_without_its_record_a_map_has_to_be_made_from_nothing(
+    cloud: Path, reference: Path, store: ts.TileStore
+) -> None:
+    record = Path(store.url) / NODE
+    record.write_bytes(record.read_bytes().replace(b'"crs": null', b'"crs": "no"', 1))
+    _, (damage,) = verify(store.url)
+    assert "remove the folder" in damage.reason
+    assert repair(store.url) == ([], [damage])
+    shutil.rmtree(store.url)
     ts.ingest(cloud, store.url, tile_size=10.0)
     assert tree(Path(store.url)) == tree(reference)
 

@@ -119,6 +119,9 @@ def _store(url: str) -> Findings:
         yield Damage(url, str(store.condition()))
     for key in store.manifest.identities:
         names = store.files.under(str(key)).names()
+        if names:
+            remove = partial(store.remove, key)
+            yield _wrong(f"{url}/{key}/{NODE}", Tile(store, key).check_group, sources, remove)
         for table in dict.fromkeys([POINTS, *(name for name in names if name != NODE)]):
             yield _tile_table(Tile(store, key), table, sources if table == POINTS else ())
 

@@ -4,7 +4,7 @@
 map.zarr/                 attributes: schema, settings, CRS, lattice origin, sources, the manifest
   manifest_4f.../         which tiles there must be, with the identity of each
   12_-3/                  a tile, named by its key
-    points                (3, n) int32 millimetres from the tile's origin, sorted by voxel
+    points                int32 millimetres from the tile's origin: all x, y, z, sorted by voxel
     cells_2000            a table made from them: its columns one after the other
 ```
 
@@ -15,7 +15,7 @@ manifest does not name is none; every reader looks at both. All that is read has
 
 import html
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
@@ -27,10 +27,7 @@ from tilestream.errors import (
     DamagedError,
     IncompleteError,
     StoreError,
-    StoreNotFoundError,
-    StoreVersionError,
     TileNotReadyError,
-    UsageError,
 )
 from tilestream.files import Files
 from tilestream.grid import MM_PER_M, Box, TileGrid, TileKey, whole_mm
@@ -39,41 +36,24 @@ from tilestream.marks import Mark
 from tilestream.records import Cells, Float64, Int64
 from tilestream.store.arrays import NODE as NODE
 from tilestream.store.arrays import (
-    checked,
     erase,
     read_columns,
+    read_group,
     read_marks,
-    said_by,
     write_columns,
     write_group,
 )
 from tilestream.store.condition import Condition as Condition
-from tilestream.store.condition import State
 from tilestream.store.manifest import Manifest as Manifest
 from tilestream.store.manifest import read_manifest, remove_other_manifests
+from tilestream.store.record import Record, State, read_record, write_record
+from tilestream.store.record import StoreSettings as StoreSettings
 from tilestream.store.table import CELLS_VERSION as CELLS_VERSION
 from tilestream.store.table import TileTable as TileTable
 from tilestream.store.table import cells_table as cells_table
-from tilestream.version import VERSION
 
-SCHEMA = 3
-"""Version of the store's layout; a store with another one is refused."""
 POINTS = "points"
 """Name of the table that ingest writes: the column `xyz`."""
-
-
-@dataclass(frozen=True)
-class StoreSettings:
-    """What a store is, written once when it is created."""
-
-    tile_size: float
-    """Edge of a tile [m], whole millimetres."""
-    halo: float
-    """Width of the halo around a tile [m], whole millimetres."""
-    map_leaf: float
-    """Edge of the voxels that points were thinned to [m]; 0: all points were kept."""
-    crs: str | None
-    """Coordinate reference system of the map, any string that pyproj reads; None: local."""
 
 
 class Tile:
@@ -189,6 +169,15 @@ class Tile:
         erase(files, f"{self.key}/{table}")
         write_columns(files, f"{self.key}/{table}", columns, mark)
 
+    def check_group(self) -> None:
+        """Read what a Zarr reader needs to find the tile's tables; we do not.
+
+        Raises:
+            DamagedError: it is not what was written.
+            OSError: it cannot be read.
+        """
+        read_group(self.store.files.under(str(self.key)))
+
     def erase(self, table: str) -> None:
         """Remove a table, if it is there: its mark first."""
         erase(self.store.files, f"{self.key}/{table}")
@@ -237,28 +226,13 @@ class TileStore:
             store.grid.require_cell_size(whole_mm(settings.map_leaf, "map_leaf"))
         if set(store.files.names()) - {LOCK}:
             raise StoreError(f"{url} is there and is no tile store: choose another path")
-        store._write("being written", None, [], {})
+        store._write(Record(settings))
         return store
 
-    def _write(
-        self,
-        state: State,
-        manifest: str | None,
-        sources: Sequence[Mapping[str, Any]],
-        made_by: Mapping[str, int],
-    ) -> None:
-        said = {
-            "schema": SCHEMA,
-            "lattice_origin": [0.0, 0.0, 0.0],
-            "settings": asdict(self.settings),
-            "state": state,
-            "manifest": manifest,
-            "sources": list(sources),
-            "made_by": dict(made_by),
-        }
-        write_group(self.files, said)
+    def _write(self, record: Record) -> None:
+        write_record(self.files, record)
         self.files.remove_parts()
-        remove_other_manifests(self.files, manifest)
+        remove_other_manifests(self.files, record.manifest)
         self.__dict__.pop("manifest", None)  # the one that was read before
 
     def sources(self) -> list[dict[str, Any]]:
@@ -266,18 +240,16 @@ class TileStore:
 
         Empty until an ingest has ended.
         """
-        found: list[dict[str, Any]] = _known(self.url)["sources"]
-        return found
+        return [dict(source) for source in read_record(self.url).sources]
 
     def made_by(self) -> dict[str, int]:
         """The stages that made the map, with their versions; empty until an ingest has ended."""
-        found: dict[str, int] = _known(self.url)["made_by"]
-        return found
+        return dict(read_record(self.url).made_by or {})
 
     @cached_property
     def manifest(self) -> Manifest | None:
         """Which tiles the map must have; None: that is not known yet."""
-        name = _known(self.url)["manifest"]
+        name = read_record(self.url).manifest
         return None if name is None else read_manifest(self.files, name)
 
     def begin(self, manifest: Manifest) -> None:
@@ -290,22 +262,20 @@ class TileStore:
         for key in [] if had is None else had.identities:
             if key not in manifest:
                 self.remove(key)
-        said = _known(self.url)
         name = manifest.write(self.files)
-        self._write("being written", name, said["sources"], said["made_by"])
+        self._write(replace(read_record(self.url), state="being written", manifest=name))
 
     def end(self, sources: Sequence[Mapping[str, Any]], made_by: Mapping[str, int]) -> None:
         """Record what the map was made from, and by which versions of the stages.
 
         A map whose tiles were never known is not whole by that.
         """
-        name = _known(self.url)["manifest"]
-        self._write("being written" if name is None else "whole", name, sources, made_by)
+        record = replace(read_record(self.url), sources=sources, made_by=made_by)
+        self._write(record if record.manifest is None else replace(record, state="whole"))
 
     def forget(self) -> None:
         """Say that it is not known which tiles the map must have: its ingest finds out again."""
-        said = _known(self.url)
-        self._write("being written", None, said["sources"], said["made_by"])
+        self._write(replace(read_record(self.url), state="being written", manifest=None))
 
     def remove(self, key: TileKey) -> None:
         """Remove a tile with all its tables; the mark of its points goes first."""
@@ -344,11 +314,11 @@ class TileStore:
             return Mark("missing", "the map is being made, its tiles are not known yet")
         if key not in self.manifest:
             return Mark("missing", "the map has no such tile")
-        if mark.status == "missing":
-            return Mark("missing", "not written yet, or lost")
-        if mark.status == "done" and mark.identity != self.manifest.identities[key]:
-            return Mark("missing", "there is one of an older map")
-        return mark
+        older = mark.status == "done" and mark.identity != self.manifest.identities[key]
+        if mark.status != "missing" and not older:
+            return mark
+        reason = "there is one of an older map" if older else "not written yet, or lost"
+        return Mark("missing", reason, facts={"read": self.manifest.points[key]})
 
     def condition(self) -> Condition:
         """Whether the map is whole, being written, or damaged."""
@@ -356,8 +326,7 @@ class TileStore:
 
     def state(self) -> State:
         """Whether the ingest that makes the map has ended."""
-        found: State = _known(self.url)["state"]
-        return found
+        return read_record(self.url).state
 
     def tile(self, key: tuple[int, int]) -> Tile:
         """The tile of a key `(ix, iy)`.
@@ -451,29 +420,4 @@ def open_store(url: str) -> TileStore:
         StoreError: something else lies there.
         UsageError: a file lies there, or where a folder above it would be.
     """
-    return TileStore(str(url), StoreSettings(**_known(str(url))["settings"]))
-
-
-def _known(url: str) -> dict[str, Any]:
-    """What a store says of itself; errors as of `open_store`."""
-    root = Files.at(url).under(NODE)
-    try:
-        text = root.read()
-        schema = int(said_by(text)["schema"])
-    except FileNotFoundError:
-        raise StoreNotFoundError(
-            f"no tile store at {url}: make one with `tilestream ingest SOURCES --store {url}`"
-        ) from None
-    except NotADirectoryError:
-        raise UsageError(
-            f"{url} is a file, or below one, and a tile store is a folder: name another path"
-        ) from None
-    except (KeyError, ValueError, TypeError) as error:
-        raise StoreError(f"{root.root} is damaged, or of no tile store: {error}") from error
-    if schema != SCHEMA:
-        what = "install the newer tilestream" if schema > SCHEMA else "give another path"
-        raise StoreVersionError(
-            f"{url} has schema {schema}, this is tilestream {VERSION} with schema {SCHEMA}: "
-            f"{what}, or remove it and ingest the sources again"
-        )
-    return checked(text, root.root)
+    return TileStore(str(url), read_record(str(url)).settings)

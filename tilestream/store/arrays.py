@@ -34,6 +34,16 @@ def write_group(files: Files, attributes: Mapping[str, Any]) -> None:
     _write_node(files, kept, attributes)
 
 
+def read_group(files: Files) -> dict[str, Any]:
+    """What a group of ours says.
+
+    Raises:
+        DamagedError: it is not what was written.
+        OSError: it cannot be read.
+    """
+    return checked(files.under(NODE).read(), f"{files.root}/{NODE}")
+
+
 def said_by(text: bytes) -> dict[str, Any]:
     """What the text of a node says of ours, its checksum not looked at.
 

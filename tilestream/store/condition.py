@@ -2,15 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
 
 from tilestream.errors import IncompleteError
 from tilestream.grid import TileKey
 from tilestream.lock import Holder
 from tilestream.marks import Mark
+from tilestream.store.record import State
 
-State = Literal["being written", "whole"]
-"""What a store says of itself: `whole` once its ingest has ended."""
 NAMED = 5
 """Tiles that a message names; of the others the number."""
 
@@ -42,13 +40,13 @@ class Condition:
     def __str__(self) -> str:
         if self.whole:
             return "whole"
+        if self.writer is not None:
+            return f"being written by {self.writer}: wait until that ends"
         if self.state == "whole":
             names = [str(key) for key in self.lost]
             more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
             tiles = f"tile{'s' if len(names) > 1 else ''} {', '.join(names[:NAMED])}{more}"
             return f"damaged, it has lost {tiles}: ingest its sources again, which makes these anew"
-        if self.writer is not None:
-            return f"being written by {self.writer}: wait until that ends"
         return "half-made: its ingest was stopped; run the same command again to end it"
 
     def require_whole(self) -> None:

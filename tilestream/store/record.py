@@ -1,0 +1,95 @@
+"""What a store says of itself, at its root: settings, state, manifest, what it was made from."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+from tilestream.errors import (
+    DamagedError,
+    StoreError,
+    StoreNotFoundError,
+    StoreVersionError,
+    UsageError,
+)
+from tilestream.files import Files
+from tilestream.store.arrays import NODE, checked, said_by, write_group
+from tilestream.version import VERSION
+
+SCHEMA = 3
+"""Version of the store's layout; a store with another one is refused."""
+State = Literal["being written", "whole"]
+"""`whole` once the ingest that makes the map has ended."""
+
+
+@dataclass(frozen=True)
+class StoreSettings:
+    """What a store is, written once when it is created."""
+
+    tile_size: float
+    """Edge of a tile [m], whole millimetres."""
+    halo: float
+    """Width of the halo around a tile [m], whole millimetres."""
+    map_leaf: float
+    """Edge of the voxels that points were thinned to [m]; 0: all points were kept."""
+    crs: str | None
+    """Coordinate reference system of the map, any string that pyproj reads; None: local."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """The record of a store."""
+
+    settings: StoreSettings
+    state: State = "being written"
+    manifest: str | None = None
+    """Name of the manifest in the store; None: which tiles it must have is not known yet."""
+    sources: Sequence[Mapping[str, Any]] = ()
+    """What the map was made from."""
+    made_by: Mapping[str, int] | None = None
+    """The stages that made it, with their versions; None: no ingest has ended."""
+
+
+def write_record(files: Files, record: Record) -> None:
+    """Write the record of the store that lies there: whole, or as it was."""
+    write_group(files, {"schema": SCHEMA, "lattice_origin": [0.0, 0.0, 0.0], **asdict(record)})
+
+
+def read_record(url: str) -> Record:
+    """The record of a store.
+
+    Raises:
+        StoreNotFoundError: nothing there.
+        StoreVersionError: written by another version of tilestream.
+        DamagedError: it is not what was written.
+        StoreError: something else lies there.
+        UsageError: a file lies there, or where a folder above it would be.
+    """
+    root = Files.at(url).under(NODE)
+    try:
+        text = root.read()
+        schema = int(said_by(text)["schema"])
+    except FileNotFoundError:
+        raise StoreNotFoundError(
+            f"no tile store at {url}: make one with `tilestream ingest SOURCES --store {url}`"
+        ) from None
+    except NotADirectoryError:
+        raise UsageError(
+            f"{url} is a file, or below one, and a tile store is a folder: name another path"
+        ) from None
+    except (KeyError, ValueError, TypeError) as error:
+        raise StoreError(f"{root.root} is damaged, or of no tile store: {error}") from error
+    if schema != SCHEMA:
+        what = "install the newer tilestream" if schema > SCHEMA else "give another path"
+        raise StoreVersionError(
+            f"{url} has schema {schema}, this is tilestream {VERSION} with schema {SCHEMA}: "
+            f"{what}, or remove it and ingest the sources again"
+        )
+    try:
+        said = checked(text, root.root)
+    except DamagedError as error:
+        raise DamagedError(
+            f"{root.root} is damaged, without which the map cannot be read: remove the folder "
+            f"{url} and ingest its sources again"
+        ) from error
+    del said["schema"], said["lattice_origin"]
+    return Record(**{**said, "settings": StoreSettings(**said["settings"])})
