@@ -68,7 +68,8 @@ def made_up(
 ) -> Comparison:
     """A comparison of one vehicle: by cell size as text, (tile, estimate) of each sample point."""
     rows = [
-        (f"car-{size}", "way", k, 40.0 * k, 40.0 * k, 0.0, 0.0, tile, value, 0.0, value, 0.0)
+        (f"car-{size}", "way", k, 40.0 * k, 40.0 * k, 0.0, 0.0, 0.0, tile, value)
+        + (0.0, value, 0.0)
         + (("done", "") if np.isfinite(value) else ("failed", "too few points"))
         for size, points in estimates.items()
         for k, (tile, value) in enumerate(points)
@@ -77,7 +78,8 @@ def made_up(
     sizes = [float(size) for size in estimates]
     counts = cells or {size: round(1000 / size) for size in sizes}
     tiles = sorted({tile for points in estimates.values() for tile, _ in points} | {"9_9"})
-    columns = ["choice", "route_id", "sample", "arc_length", "x", "y", "z", "tile"]
+    columns = ["choice", "route_id", "sample", "arc_length", "x", "y", "z"]
+    columns += ["above_ground", "tile"]
     columns += ["vd_mean", "vd_p_fail", "vd_along", "vd_across", "status", "reason"]
     return Comparison(
         pd.DataFrame(rows, columns=columns),
@@ -134,7 +136,7 @@ def test_more_range_never_makes_fewer_returns(found: Comparison, street: Path) -
 def test_the_plan_makes_what_choices_share_once(
     store: ts.TileStore, route: ts.Route, tmp_path: Path
 ) -> None:
-    how = (8.0, ts.RegistrationSettings(), 2.0, SEEING, DEFAULT_MEMORY)
+    how = (8.0, ts.RegistrationSettings(), 2.0, "ground", SEEING, DEFAULT_MEMORY)
     plan = plan_compare(store, [route], tmp_path, CHOICES, *how)
     keys = [task.key for task in plan.tasks]
     assert len(keys) == len(set(keys))

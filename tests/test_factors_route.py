@@ -16,12 +16,14 @@ import tilestream as ts
 from tilestream.cli import run
 from tilestream.errors import SourceError, UsageError
 from tilestream.factors.rows import samples_by_tile
+from tilestream.factors.sample_points import raised
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.formats.routes import resample, route_of, write_geojson_route
 from tilestream.grid import TileGrid
 from tilestream.marks import Mark
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.jobs.run_folder import map_of
+from tilestream.records import Float64, RouteZ
 from tilestream.store import POINTS, Tile
 
 SENSOR = ts.VLP16.model_copy(update={"name": "short", "range_max": 25.0})
@@ -116,10 +118,20 @@ def test_sample_points_lie_a_sensor_height_above_the_ground(
     for x, y, z in points:
         near = (cloud[:, 0] - x) ** 2 + (cloud[:, 1] - y) ** 2 <= 1.0
         assert z == pytest.approx(np.percentile(cloud[near, 2], 5.0) + 1.5, abs=1e-9)
-    with_z = route_of("z", np.array([[0.0, 0.0, 7.0], [10.0, 0.0, 8.0]]))
-    np.testing.assert_allclose(
-        ts.sample_points(with_z, store, spacing=5.0).positions[:, 2], [9.0, 9.5, 10.0], atol=0.02
-    )
+
+
+@pytest.mark.parametrize("above", [-1.0, 0.0, 0.3, 1.7, 4.0])
+def test_z_of_a_route_is_what_it_is_said_to_be(store: ts.TileStore, above: float) -> None:
+    flat = route_of("flat", np.array([[10.0, 0.0, np.nan], [30.0, 0.0, np.nan]]))
+    ground = ts.sample_points(flat, store, spacing=5.0, sensor_height=0.0).positions[:, 2]
+    at = np.column_stack([np.linspace(10.0, 30.0, 5), np.zeros(5), ground + above])
+
+    def heights(route_z: RouteZ) -> Float64:
+        return raised(at, store, 2.0, route_z).lidar[:, 2] - ground
+
+    np.testing.assert_allclose(heights("ground"), 2.0, atol=1e-9)
+    np.testing.assert_allclose(heights("road"), above + 2.0, atol=1e-9)
+    np.testing.assert_allclose(heights("lidar"), above, atol=1e-9)
 
 
 @pytest.mark.parametrize("tile_size", [pytest.param(10.0, marks=pytest.mark.slow), 64.0])

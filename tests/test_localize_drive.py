@@ -160,6 +160,7 @@ def test_every_label_is_that_of_localization_error(
             expected.error_tail,
         )
         assert (row["x"], row["y"], row["z"]) == tuple(scan.T_map_lidar[:3, 3])
+        assert row["lidar_height"] == pytest.approx(2.0, abs=0.15)
         assert row["stamp_ns"] == scan.stamp_ns
         assert row["starts"] == 13
         assert row["points"] == expected.registrations.points
@@ -490,6 +491,7 @@ def test_the_real_drive_localizes_within_centimetres(shared_data: Path, tmp_path
     assert (labels["starts"] == len(start_poses(np.eye(4), starts))).all()
     assert labels["error_mean"].mean() < 0.06
     assert (labels["p_fail"] == 0.0).all()
+    assert labels["lidar_height"].between(1.6, 1.9).all()  # KITTI's is mounted at 1.73 m
     less = Reading(str(log), beams=16, range_max=30.0, blind_rear_deg=120.0)
     simpler = ts.localize(store, log, tmp_path / "less", scans=odd, starts=starts, reading=less)
     assert simpler["error_mean"].mean() > labels["error_mean"].mean()

@@ -255,6 +255,9 @@ class Registrations:
 
 TruePose = Literal["log", "refined"]
 """Source of a true pose: the log (or the simulator), or refined with the same scan."""
+RouteZ = Literal["ground", "road", "lidar"]
+"""What is made of z of a route: it only says near which ground of the map the road is; it is the
+road; it is the lidar."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from pydantic import BeforeValidator, Field
 
 from tilestream.config import Settings
 from tilestream.errors import UsageError
-from tilestream.records import TruePose
+from tilestream.records import RouteZ, TruePose
 from tilestream.sensor import SENSORS, Carrier, Sensor, Vehicle, named
 
 Positive = Annotated[float, Field(gt=0.0)]
@@ -287,6 +287,9 @@ class PlaceSettings(Settings):
     with its mount."""
     sensor_height: Annotated[float, Field(ge=0.0, le=10.0)] = 2.0
     """Height of the lidar above the road [m]; with a mount, of the vehicle's origin."""
+    route_z: RouteZ = "ground"
+    """What z of a route is: `ground` takes the ground of the map that is nearest to it, `road` and
+    `lidar` take it as it is."""
     cell_size: Positive = 2.0
     """Edge of an NDT cell [m]."""
     memory: Bytes = Field(default="1.5GB", validate_default=True)

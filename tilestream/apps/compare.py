@@ -23,7 +23,7 @@ from tilestream.pipeline.jobs.along_routes import SENSOR_HEIGHT, plan_observe, s
 from tilestream.pipeline.jobs.inventory import make_tables
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.observe import Observing, observe
-from tilestream.records import Route
+from tilestream.records import Route, RouteZ
 from tilestream.report.comparison import CELL_COLUMNS, ROW_COLUMNS, USUAL, Comparison
 from tilestream.sensor import Carrier
 from tilestream.settings import LabelSettings, RegistrationSettings, VirtualSettings
@@ -111,6 +111,7 @@ def compare(
     spacing: float = SPACING,
     registration: RegistrationSettings | None = None,
     sensor_height: float = SENSOR_HEIGHT,
+    route_z: RouteZ = "ground",
     seeing: VirtualSettings | None = None,
     client: Any | None = None,
     memory: int = DEFAULT_MEMORY,
@@ -127,7 +128,8 @@ def compare(
         choices: what is compared, at least one, no two of one name.
         spacing: distance between sample points [m].
         registration: the matcher of the vehicle; default `autoware`, as of all jobs.
-        sensor_height: height of the lidar above the route or the ground [m].
+        sensor_height: height of the lidar above the road [m].
+        route_z: what is made of z of the routes.
         seeing: drop-outs, starts, seed; its range and blind sector give way to each choice's.
         client: a Dask client to run on; None: this process.
         memory: what a task may use [bytes].
@@ -149,7 +151,17 @@ def compare(
     routes, registration = list(routes), registration or LabelSettings().registration
     seeing = seeing or VirtualSettings()
     plan = plan_compare(
-        store, routes, out, choices, spacing, registration, sensor_height, seeing, memory, partial
+        store,
+        routes,
+        out,
+        choices,
+        spacing,
+        registration,
+        sensor_height,
+        route_z,
+        seeing,
+        memory,
+        partial,
     )
     tables: dict[str, list[str]] = {choice.name: [] for choice in choices}
     for path in paths_of(plan.outputs(observe.name)):
@@ -168,6 +180,7 @@ def compare(
         "tile_size": store.settings.tile_size,
         "spacing": spacing,
         "sensor_height": sensor_height,
+        "route_z": route_z,
         "matcher": registration.told,
         **{f"registration.{name}": value for name, value in registration.model_dump().items()},
         **{f"seeing.{name}": value for name, value in seeing.model_dump(exclude=own).items()},
@@ -183,6 +196,7 @@ def plan_compare(
     spacing: float,
     registration: RegistrationSettings,
     sensor_height: float,
+    route_z: RouteZ,
     seeing: VirtualSettings,
     memory: int,
     partial: bool = False,
@@ -196,7 +210,12 @@ def plan_compare(
     samples = samples_along(store, routes, spacing)
     for choice in choices:
         observing = Observing(
-            choice.sensor, choice.seeing(seeing), registration, choice.cell_size, sensor_height
+            choice.sensor,
+            choice.seeing(seeing),
+            registration,
+            choice.cell_size,
+            sensor_height,
+            route_z,
         )
         folder = f"{os.fspath(out)}/{choice.name}"
         planned = plan_observe(map_plan, samples, folder, observing, memory, group=choice.name)

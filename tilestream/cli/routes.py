@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Any
 
+import pandas as pd
 import typer
 
 from tilestream.apps import compare as comparing
@@ -10,7 +11,7 @@ from tilestream.cli.cluster import HERE, Cluster, on_cluster
 from tilestream.cli.fields import fields, with_settings
 from tilestream.cli.maps import LOG_FIELDS
 from tilestream.cli.options import AsJson, DryRun, Routes, StoreUrl, numbers, routes_of
-from tilestream.cli.printing import out, print_json, say
+from tilestream.cli.printing import err, out, print_json, say
 from tilestream.cli.progress import progress
 from tilestream.cli.tables import (
     comparison_table,
@@ -21,6 +22,7 @@ from tilestream.cli.tables import (
 )
 from tilestream.errors import PartialError
 from tilestream.factors.catalogue import Which
+from tilestream.factors.heights import notes_of_routes
 from tilestream.pipeline.jobs import along_routes
 from tilestream.pipeline.jobs import localize as localize_drive
 from tilestream.pipeline.jobs.run_inputs import reading_of, scans_of
@@ -127,7 +129,9 @@ def factors(
     which_map: Annotated[MapSettings, fields("partial")],
     places: Annotated[
         PlaceSettings,
-        fields("spacing", "sensor", "sensor_height", "cell_size", "project_to", "memory"),
+        fields(
+            "spacing", "sensor", "sensor_height", "route_z", "cell_size", "project_to", "memory"
+        ),
     ],
     which: Annotated[Which, typer.Option(help="The paper's 20, their robust twins.")] = "all",
     dry_run: DryRun = False,
@@ -138,9 +142,9 @@ def factors(
     opened = open_store(store)
     with routes_of(route, places.project_to, places.spacing, opened.settings.crs) as read:
         routes = read.routes
-        sensor, height = places.looking_sensor, places.sensor_height
+        sensor, height, z = places.looking_sensor, places.sensor_height, places.route_z
         if dry_run:
-            looking = Looking(sensor, places.cell_size, which, height)
+            looking = Looking(sensor, places.cell_size, which, height, z)
             samples = along_routes.samples_along(opened, routes, places.spacing)
             seen = MapPlan.of_store(opened, partial=which_map.partial)
             plan = along_routes.plan_factors(seen, samples, folder, looking, places.memory)
@@ -154,6 +158,7 @@ def factors(
                 spacing=places.spacing,
                 sensor=sensor,
                 sensor_height=height,
+                route_z=z,
                 cell_size=places.cell_size,
                 which=which,
                 client=client,
@@ -162,9 +167,10 @@ def factors(
                 partial=which_map.partial,
             )
         counts = rows["status"].value_counts()
+        notes = [*read.notes, *_heights_told(rows, places)]
         if as_json:
             found = {str(status): int(count) for status, count in counts.items()}
-            print_json({"sample_points": len(rows), **found, "notes": list(read.notes)})
+            print_json({"sample_points": len(rows), **found, "notes": notes})
         else:
             out.print(factor_table(rows))
             say(f"The tables are in {folder}/factors")
@@ -183,7 +189,14 @@ def compare(
     which_map: Annotated[MapSettings, fields("partial")],
     places: Annotated[
         PlaceSettings,
-        fields("spacing", "sensor_height", "project_to", "memory", spacing=comparing.SPACING),
+        fields(
+            "spacing",
+            "sensor_height",
+            "route_z",
+            "project_to",
+            "memory",
+            spacing=comparing.SPACING,
+        ),
     ],
     labels: Annotated[LabelSettings, fields("matcher")],
     report: Annotated[ReportSettings, fields("threshold")],
@@ -215,6 +228,7 @@ def compare(
             numbers(cell_size, "--cell-size"),
         )
         registration, height = labels.registration, places.sensor_height
+        z = places.route_z
         if dry_run:
             plan = comparing.plan_compare(
                 opened,
@@ -224,6 +238,7 @@ def compare(
                 places.spacing,
                 registration,
                 height,
+                z,
                 VirtualSettings(),
                 places.memory,
                 which_map.partial,
@@ -239,13 +254,24 @@ def compare(
                 spacing=places.spacing,
                 registration=registration,
                 sensor_height=height,
+                route_z=z,
                 client=client,
                 memory=places.memory,
                 watch=watch,
                 partial=which_map.partial,
             )
         content = write_comparison(found, folder, threshold=report.threshold, cap=cap)
-        _show_comparison({**content, "notes": list(read.notes)}, store, folder, as_json)
+        first = found.rows[found.rows["choice"] == found.rows["choice"].iloc[0]]
+        notes = [*read.notes, *_heights_told(first, places)]
+        _show_comparison({**content, "notes": notes}, store, folder, as_json)
+
+
+def _heights_told(rows: pd.DataFrame, places: PlaceSettings) -> list[str]:
+    """What the heights of sample points tell, printed."""
+    notes = notes_of_routes(rows, places.sensor_height, places.route_z)
+    for note in notes:
+        say(note, to=err)
+    return notes
 
 
 def _show_comparison(content: dict[str, Any], store: str, folder: str, as_json: bool) -> None:

@@ -13,7 +13,7 @@ from tilestream.errors import UsageError
 from tilestream.factors.sample_points import raised
 from tilestream.formats.routes import resample
 from tilestream.grid import MM_PER_M, TileGrid, TileKey
-from tilestream.records import Column, Float64, Int64, Route
+from tilestream.records import Column, Float64, Int64, Route, RouteZ
 from tilestream.store import TileStore
 
 PLACE_COLUMNS = (
@@ -27,7 +27,14 @@ PLACE_COLUMNS = (
         "z",
         "place",
         "m",
-        "Place of the lidar: route or ground, plus its height.",
+        "Place of the lidar: ground or route, plus its height.",
+        "definitions, section 2",
+    ),
+    Column(
+        "above_ground",
+        "place",
+        "m",
+        "z of the route - ground of the map; NaN: either is not known.",
         "definitions, section 2",
     ),
 )
@@ -35,7 +42,6 @@ STATUS_COLUMNS = (
     Column("status", "place", "", "done, missing or failed.", "", dtype="str"),
     Column("reason", "place", "", "Why it is not done.", "", dtype="str"),
 )
-
 
 ROW = np.dtype(
     [
@@ -137,20 +143,45 @@ def in_route_order(rows: pd.DataFrame, route_ids: Sequence[str]) -> pd.DataFrame
     return rows.reset_index(drop=True)
 
 
-def sample_rows(samples: Samples, store: TileStore, sensor_height: float) -> pd.DataFrame:
-    """Sample points as rows of `PLACE_COLUMNS`, raised to the lidar.
+def sample_rows(
+    samples: Samples, store: TileStore, sensor_height: float, route_z: RouteZ
+) -> tuple[pd.DataFrame, NDArray[np.object_]]:
+    """Sample points as rows of `PLACE_COLUMNS`, at the height of the lidar.
 
     Args:
-        samples: the sample points, on the road.
-        store: the map; it gives the ground where a route has no z.
+        samples: the sample points, on the route.
+        store: the map; it gives the ground.
         sensor_height: height of the lidar above the road [m].
+        route_z: what is made of z of the route.
+
+    Returns:
+        The rows, and of each why it is not taken (`Raised.why`).
 
     Raises:
         UsageError: a height that is not finite.
-        TileNotReadyError: a tile under the sample points failed or was skipped.
     """
     frame = pd.DataFrame.from_records(samples.rows)
     frame["route_id"] = [samples.route_ids[number] for number in frame.pop("route")]
-    frame["z"] = raised(frame[["x", "y", "z"]].to_numpy(), store, sensor_height)[:, 2]
+    at = frame[["x", "y", "z"]].to_numpy()
+    found = raised(at, store, sensor_height, route_z)
+    frame["z"], frame["above_ground"] = found.lidar[:, 2], found.above_ground
     types = {column.name: column.dtype for column in PLACE_COLUMNS}
-    return frame[list(types)].astype(types)
+    return frame[list(types)].astype(types), found.why
+
+
+def with_places(
+    found: pd.DataFrame, places: pd.DataFrame, why: NDArray[np.object_]
+) -> pd.DataFrame:
+    """What was found at sample points, behind their places; one that is not taken says why.
+
+    Args:
+        found: a row per place, with `status` and `reason`.
+        places: the rows of `sample_rows`.
+        why: why they are not taken, likewise.
+    """
+    numbers = [name for name in found if name not in ("status", "reason")]
+    table = pd.concat([places, found], axis=1)
+    table.loc[why != "", numbers] = np.nan
+    table.loc[why != "", "status"] = "failed"
+    table["reason"] = np.where(why != "", why, table["reason"])
+    return table

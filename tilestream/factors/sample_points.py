@@ -1,97 +1,112 @@
 """Sample points: places on a route, raised to where the lidar is (definitions, section 2)."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from tilestream.errors import UsageError
+from tilestream.errors import TileNotReadyError, UsageError
+from tilestream.factors.ground import ground_under
 from tilestream.formats.routes import resample
-from tilestream.grid import MM_PER_M, Box, TileKey
-from tilestream.records import Float64, Int64, Route
-from tilestream.store import POINTS, Tile, TileStore
+from tilestream.records import Float64, Route, RouteZ
+from tilestream.store import TileStore
 
-GROUND_RADIUS_MM = 1000
-"""Horizontal distance around a place within which map points give the ground [mm]."""
-GROUND_PERCENTILE = 5.0
-"""Which percentile of the heights there counts as the ground."""
+MOST_OFF = 5.0
+"""How far a route, or the road under it, may be above or below the ground of the map [m]."""
+OFF_GROUND = (
+    f"the route is more than {MOST_OFF:g} m above or below the ground of the map: are its heights "
+    "those of the map? leave z out to take the ground"
+)
+"""Why a place is not taken."""
 
 
 def sample_points(
-    route: Route, store: TileStore, spacing: float = 1.0, sensor_height: float = 2.0
+    route: Route,
+    store: TileStore,
+    spacing: float = 1.0,
+    sensor_height: float = 2.0,
+    route_z: RouteZ = "ground",
 ) -> Route:
     """The places of the lidar along a route, at equal steps of arc length.
 
     Args:
         route: a path on the road, in the map's frame.
-        store: the map; it gives the ground where the route has no z.
+        store: the map; it gives the ground.
         spacing: arc length between sample points [m].
         sensor_height: height of the lidar above the road [m].
+        route_z: what is made of z of the route.
 
     Returns:
-        The sample points as a route; z is NaN where there is neither route z nor ground.
+        The sample points as a route; z is NaN where there is no height, see `raised`.
 
     Raises:
         UsageError: `spacing` is not positive or longer than the route, a height that is not finite.
         TileNotReadyError: a tile under the route failed or was skipped.
     """
     points = resample(route, spacing)
-    return replace(points, positions=raised(points.positions, store, sensor_height))
+    at = raised(points.positions, store, sensor_height, route_z)
+    for reason in at.why:
+        if reason not in ("", OFF_GROUND):
+            raise TileNotReadyError(reason)
+    return replace(points, positions=at.lidar)
 
 
-def raised(positions: ArrayLike, store: TileStore, sensor_height: float = 2.0) -> Float64:
-    """Places on the road, raised to the lidar's height: z + height, or ground + height if z is NaN.
+@dataclass(frozen=True, eq=False)
+class Raised:
+    """Places on a route, at the height of the lidar."""
 
-    The ground is the 5th percentile (linear between ranks) of z of the map points within 1.0 m
-    horizontally.
+    lidar: Float64
+    """(k, 3) places of the lidar [m]; z is NaN where no map points give the ground that is needed,
+    and where `why` says something."""
+    above_ground: Float64
+    """(k,) z of the route - ground [m]; NaN where either is not known."""
+    why: NDArray[np.object_]
+    """(k,) why a place is not taken: its road would be more than 5 m from the ground, or the map
+    there cannot be read; else empty."""
+
+
+def raised(
+    positions: ArrayLike,
+    store: TileStore,
+    sensor_height: float = 2.0,
+    route_z: RouteZ = "ground",
+) -> Raised:
+    """Places on a route, raised to the lidar.
+
+    The lidar is `sensor_height` above the ground of the map (`ground_under`); with `route_z` `road`
+    above z, with `lidar` at z, where there is one.
 
     Args:
         positions: (k, 3) places [m, map frame]; z may be NaN.
         store: the map.
         sensor_height: height of the lidar above the road [m].
-
-    Returns:
-        (k, 3) places of the lidar [m]; z stays NaN where there are no map points.
+        route_z: what is made of z.
 
     Raises:
         UsageError: a height that is not finite.
-        TileNotReadyError: a tile under the route failed or was skipped.
     """
     if not np.isfinite(sensor_height):
         raise UsageError(f"sensor_height is {sensor_height!r}: give metres")
     places: Float64 = np.array(positions, np.float64)
-    flat = np.flatnonzero(np.isnan(places[:, 2]))
-    tile_of = [store.grid.key_at(x, y) for x, y in places[flat, :2].tolist()]
-    for key in sorted(set(tile_of)):
-        rows = flat[[near == key for near in tile_of]]
-        places[rows, 2] = _ground(places[rows, :2], _points_around(store, key))
-    places[:, 2] += sensor_height
-    return places
+    z = places[:, 2].copy()
+    ground, why = ground_under(places, store, route_z, sensor_height)
+    lidar = ground + sensor_height
+    if route_z != "ground":
+        own = z + (sensor_height if route_z == "road" else 0.0)
+        lidar = np.where(np.isnan(z), lidar, own)
+    why[off_ground(z - ground, sensor_height, route_z)] = OFF_GROUND
+    places[:, 2] = np.where(why == "", lidar, np.nan)
+    return Raised(places, z - ground, why)
 
 
-def _points_around(store: TileStore, key: TileKey) -> Int64:
-    """The map points [mm] of a tile and of 1 m around it."""
-    box: Box = store.grid.core(key).grown(GROUND_RADIUS_MM + 1)
-    parts = [np.zeros((0, 3), np.int64)]
-    for near in store.grid.keys_over(box):
-        if Tile(store, near).mark(POINTS).status != "missing":
-            points = store.tile(near).points_mm()
-            x, y = points[:, 0], points[:, 1]
-            inside = (x >= box.x_lo) & (x < box.x_hi) & (y >= box.y_lo) & (y < box.y_hi)
-            parts.append(points[inside])
-    return np.concatenate(parts)
+def off_ground(above_ground: Float64, sensor_height: float, route_z: RouteZ) -> NDArray[np.bool_]:
+    """(k,) whether a road is so far from the ground of the map that no place is taken there.
 
-
-def _ground(places: Float64, points_mm: Int64) -> Float64:
-    """(k,) height of the ground under (k, 2) places [m]; NaN where there are no points."""
-    points_mm = points_mm[np.argsort(points_mm[:, 0], kind="stable")]
-    at = places * MM_PER_M
-    first = np.searchsorted(points_mm[:, 0], at[:, 0] - GROUND_RADIUS_MM, "left")
-    last = np.searchsorted(points_mm[:, 0], at[:, 0] + GROUND_RADIUS_MM, "right")
-    ground = np.full(len(places), np.nan)
-    for row, (x, y) in enumerate(at):
-        strip = points_mm[first[row] : last[row]]
-        near = (strip[:, 0] - x) ** 2 + (strip[:, 1] - y) ** 2 <= GROUND_RADIUS_MM**2
-        if near.any():
-            ground[row] = np.percentile(strip[near, 2], GROUND_PERCENTILE) / MM_PER_M
-    return ground
+    Args:
+        above_ground: (k,) z of the route - ground [m]; NaN: not known, and not off.
+        sensor_height: height of the lidar above the road [m].
+        route_z: what z of the route is.
+    """
+    road = above_ground - (sensor_height if route_z == "lidar" else 0.0)
+    far: NDArray[np.bool_] = np.abs(road) > MOST_OFF
+    return far

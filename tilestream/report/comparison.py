@@ -13,7 +13,7 @@ from tilestream.report.summary import by_reason, plain, quantiles
 from tilestream.version import VERSION
 
 ROW_COLUMNS = (
-    "choice", "route_id", "sample", "arc_length", "x", "y", "z", "tile",
+    "choice", "route_id", "sample", "arc_length", "x", "y", "z", "above_ground", "tile",
     "vd_mean", "vd_p_fail", "vd_along", "vd_across", "status", "reason",
 )  # fmt: skip
 """A row per choice and sample point: place [m], tile, what the virtual drive estimates [m, 1]."""

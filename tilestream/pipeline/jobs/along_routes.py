@@ -18,7 +18,7 @@ from tilestream.pipeline.jobs.inventory import make_tables
 from tilestream.pipeline.stages.factors import Looking, factors, factors_task
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.observe import Observing, observe, observe_task
-from tilestream.records import Route
+from tilestream.records import Route, RouteZ
 from tilestream.sensor import VLP16, Carrier, Sensor
 from tilestream.settings import LabelSettings, RegistrationSettings, VirtualSettings
 from tilestream.store import TileStore
@@ -36,6 +36,7 @@ def factors_along(
     spacing: float = 1.0,
     sensor: Sensor = VLP16,
     sensor_height: float = SENSOR_HEIGHT,
+    route_z: RouteZ = "ground",
     cell_size: float = 2.0,
     which: Which = "all",
     client: Any | None = None,
@@ -52,8 +53,8 @@ def factors_along(
             of an earlier, other job there are removed.
         spacing: distance between sample points [m].
         sensor: what looks.
-        sensor_height: height of the lidar above the route, or above the ground where the route
-            has no z [m].
+        sensor_height: height of the lidar above the road [m].
+        route_z: what is made of z of the routes.
         cell_size: edge of an NDT cell [m].
         which: `faithful` (the paper's 20), `robust` (their twins), or `all`.
         client: a Dask client to run on; None: this process.
@@ -73,7 +74,7 @@ def factors_along(
         PartialError: some tasks failed; the message lists them, the rest is done.
     """
     routes = list(routes)
-    looking = Looking(sensor, cell_size, which, sensor_height)
+    looking = Looking(sensor, cell_size, which, sensor_height, route_z)
     samples = samples_along(store, routes, spacing)
     plan = plan_factors(MapPlan.of_store(store, partial=partial), samples, out, looking, memory)
     return _tables_of(plan, factors.name, out, routes, client, watch)
@@ -131,6 +132,7 @@ def observe_along(
     seeing: VirtualSettings | None = None,
     registration: RegistrationSettings | None = None,
     sensor_height: float = SENSOR_HEIGHT,
+    route_z: RouteZ = "ground",
     cell_size: float = 2.0,
     client: Any | None = None,
     memory: int = DEFAULT_MEMORY,
@@ -148,8 +150,8 @@ def observe_along(
         sensor: what looks.
         seeing: usable range, blind sector, drop-outs, starts; default `VirtualSettings()`.
         registration: the matcher of the vehicle; default `autoware`, as of all jobs.
-        sensor_height: height of the lidar above the route, or above the ground where the route
-            has no z [m].
+        sensor_height: height of the lidar above the road [m].
+        route_z: what is made of z of the routes.
         cell_size: edge of an NDT cell [m].
         client: a Dask client to run on; None: this process.
         memory: what a task may use [bytes].
@@ -174,6 +176,7 @@ def observe_along(
         registration or LabelSettings().registration,
         cell_size,
         sensor_height,
+        route_z,
     )
     samples = samples_along(store, routes, spacing)
     plan = plan_observe(MapPlan.of_store(store, partial=partial), samples, out, observing, memory)

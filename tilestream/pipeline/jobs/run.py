@@ -37,7 +37,7 @@ from tilestream.pipeline.jobs.run_book import (
     told_before,
     write_text,
 )
-from tilestream.pipeline.jobs.run_findings import Done, findings_of
+from tilestream.pipeline.jobs.run_findings import Done, findings_of, heights_told
 from tilestream.pipeline.jobs.run_inputs import (
     Inputs,
     check_model,
@@ -262,6 +262,7 @@ def _report(settings: RunSettings, inputs: Inputs, story: _Story, book: Book) ->
     done = Done(tuple(task for task in book.tasks if task.key in good))
     if not done.outputs("factors"):
         return
+    book.facts["notes"] += heights_told(done, settings)
     known = done.dataset()
     if known is not None:
         book.facts |= {"labelled": len(known), "lost_labels": known.losses}

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from tilestream.errors import ModelError
+from tilestream.factors.heights import note_of_drive, notes_of_routes
 from tilestream.factors.virtual_drive import physics
 from tilestream.grid import MM_PER_M, Box
 from tilestream.model.dataset import TARGETS, Dataset
@@ -17,7 +18,7 @@ from tilestream.model.registry import REGRESSORS
 from tilestream.model.training import MAIN, PREDICTION_COLUMNS
 from tilestream.pipeline.engine.plan import paths_of
 from tilestream.pipeline.engine.stage import Task
-from tilestream.pipeline.jobs.run_settings import ModelSettings
+from tilestream.pipeline.jobs.run_settings import ModelSettings, RunSettings
 from tilestream.pipeline.stages.evaluate import by_protocol
 from tilestream.pipeline.stages.samples import places_with_factors
 from tilestream.records import Float64
@@ -81,6 +82,18 @@ def places_of(done: Done) -> pd.DataFrame:
     joined.loc[lost, "reason"] = "no estimate: its task failed, see run.json"
     dtypes = {c.name: c.dtype for c in PREDICTION_COLUMNS if c.dtype == "float64"}
     return joined.astype(dtypes)
+
+
+def heights_told(done: Done, settings: RunSettings) -> list[str]:
+    """What the heights of the routes and of the drives' lidars tell, a sentence each."""
+    places = read_tables(paths_of(done.outputs("factors")))
+    notes = notes_of_routes(places, settings.sensor_height, settings.route_z)
+    of_drive: dict[str, list[str]] = {}
+    for path in paths_of(done.outputs("label")):
+        of_drive.setdefault(path.rsplit("/", 2)[1], []).append(path)
+    for name, paths in of_drive.items():
+        notes += note_of_drive(name, read_tables(paths)["lidar_height"], settings.sensor_height)
+    return notes
 
 
 def labels_of(

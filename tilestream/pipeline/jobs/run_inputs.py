@@ -248,6 +248,7 @@ def observing_of(settings: RunSettings, seeing: VirtualSettings) -> Observing:
         settings.label.registration,
         settings.cell_size,
         settings.sensor_height,
+        settings.route_z,
     )
 
 

@@ -60,7 +60,13 @@ def plan_measure(settings: RunSettings, inputs: Inputs, map_plan: MapPlan) -> Pl
         map_plan: the map, as far as it is there or will be.
     """
     tables = f"{settings.out}/tables"
-    looking = Looking(settings.looking_sensor, settings.cell_size, "all", settings.sensor_height)
+    looking = Looking(
+        settings.looking_sensor,
+        settings.cell_size,
+        "all",
+        settings.sensor_height,
+        settings.route_z,
+    )
     places = samples_along(map_plan.store, inputs.routes, settings.spacing)
     memory = settings.memory
     plans = [plan_factors(map_plan, places, tables, looking, memory)]

@@ -3,10 +3,8 @@
 from dataclasses import dataclass
 from functools import lru_cache
 
-import pandas as pd
-
 from tilestream.factors.catalogue import COLUMNS, Which
-from tilestream.factors.rows import PLACE_COLUMNS, STATUS_COLUMNS, Samples, sample_rows
+from tilestream.factors.rows import PLACE_COLUMNS, STATUS_COLUMNS, Samples, sample_rows, with_places
 from tilestream.factors.table import TermsCache
 from tilestream.factors.table import factors as factors_of
 from tilestream.grid import Box, TileKey, whole_mm
@@ -15,6 +13,7 @@ from tilestream.pipeline.engine.outputs import Made, Parquet
 from tilestream.pipeline.engine.stage import Task, stage
 from tilestream.pipeline.stages.map_part import MapPart
 from tilestream.pipeline.stages.map_plan import MapPlan
+from tilestream.records import RouteZ
 from tilestream.sensor import Sensor
 from tilestream.store import open_store
 
@@ -37,12 +36,14 @@ class Looking:
     which: Which
     """Which set of factors."""
     sensor_height: float
-    """Height of the lidar above the ground or the route [m]."""
+    """Height of the lidar above the road [m]."""
+    route_z: RouteZ = "ground"
+    """What is made of z of the route."""
 
 
 @stage(
     "factors",
-    version=2,
+    version=3,
     memory=lambda counts: FIXED_BYTES + BYTES_PER_POINT * counts["largest"],
     seconds=0.002,
     columns=(*PLACE_COLUMNS, *COLUMNS, *STATUS_COLUMNS),
@@ -50,12 +51,13 @@ class Looking:
 def factors(map_part: MapPart, samples: Samples, looking: Looking) -> Made:
     """The factors of sample points, a row each."""
     store = map_part.store
-    frame = sample_rows(samples, store, looking.sensor_height)
-    positions = frame[["x", "y", "z"]].to_numpy()
+    places, why = sample_rows(samples, store, looking.sensor_height, looking.route_z)
+    positions = places[["x", "y", "z"]].to_numpy()
     cache = _cache(map_part.store_url, looking.cell_size, map_part.state)
     found = factors_of(store, positions, looking.sensor, looking.cell_size, looking.which, cache)
     facts = {"data_set": canonical(looking), "store": store.address}
-    return Made(pd.concat([frame, found], axis=1), facts)
+    rows = with_places(found, places, why)
+    return Made(rows, facts)
 
 
 @lru_cache(maxsize=1)

@@ -18,6 +18,7 @@ ERROR_COLUMNS = (
     Column("y", "place", "m", "True position of the lidar in the map.", "see true_pose"),
     Column("z", "place", "m", "True position of the lidar in the map.", "see true_pose"),
     Column("heading", "place", "rad", "True heading, from the map's x axis.", "see true_pose"),
+    Column("lidar_height", "place", "m", "Of the log's pose above the ground of the map.", ""),
     Column("arc_length", "place", "m", "Length of the drive up to here.", "of the log's poses"),
     Column("true_pose", "label", "", "log or refined.", "definitions, section 5", dtype="str"),
     Column("as_sensor", "label", "", "As if by which sensor the log was read.", "", dtype="str"),
@@ -62,7 +63,7 @@ BYTES_PER_ROW = 600
 
 @stage(
     "label",
-    version=2,
+    version=3,
     memory=lambda counts: FIXED_BYTES + BYTES_PER_ROW * counts["rows"],
     seconds=0.006,
     columns=ERROR_COLUMNS,

@@ -2,16 +2,15 @@
 
 from dataclasses import dataclass
 
-import pandas as pd
-
 from tilestream.factors.observability import COLUMNS, MARGIN, observability
-from tilestream.factors.rows import PLACE_COLUMNS, STATUS_COLUMNS, Samples, sample_rows
+from tilestream.factors.rows import PLACE_COLUMNS, STATUS_COLUMNS, Samples, sample_rows, with_places
 from tilestream.grid import Box, TileKey, whole_mm
 from tilestream.marks import canonical
 from tilestream.pipeline.engine.outputs import Made, Parquet
 from tilestream.pipeline.engine.stage import Stage, Task, stage
 from tilestream.pipeline.stages.map_part import MapPart
 from tilestream.pipeline.stages.map_plan import MapPlan
+from tilestream.records import RouteZ
 from tilestream.sensor import Carrier, rim_of
 from tilestream.settings import RegistrationSettings, VirtualSettings
 
@@ -35,7 +34,9 @@ class Observing:
     cell_size: float
     """Edge of a cell [m]."""
     sensor_height: float
-    """Height of the lidar above the ground or the route [m]."""
+    """Height of the lidar above the road [m]."""
+    route_z: RouteZ = "ground"
+    """What is made of z of the route."""
 
     @property
     def range_max(self) -> float:
@@ -51,7 +52,7 @@ class Observing:
 
 @stage(
     "observe",
-    version=3,
+    version=4,
     memory=lambda counts: FIXED_BYTES + BYTES_PER_POINT * counts["points"],
     seconds=0.18,
     columns=(*PLACE_COLUMNS, *COLUMNS, *STATUS_COLUMNS),
@@ -59,17 +60,18 @@ class Observing:
 def observe(map_part: MapPart, samples: Samples, observing: Observing) -> Made:
     """The observability of sample points, a row each."""
     store = map_part.store
-    frame = sample_rows(samples, store, observing.sensor_height)
+    places, why = sample_rows(samples, store, observing.sensor_height, observing.route_z)
     found = observability(
         store,
-        frame[["x", "y", "z"]].to_numpy(),
-        frame["heading"].to_numpy(),
+        places[["x", "y", "z"]].to_numpy(),
+        places["heading"].to_numpy(),
         observing.sensor,
         observing.seeing,
         observing.registration,
         observing.cell_size,
     )
-    return Made(pd.concat([frame, found], axis=1), {"data_set": canonical(observing)})
+    rows = with_places(found, places, why)
+    return Made(rows, {"data_set": canonical(observing)})
 
 
 @stage(

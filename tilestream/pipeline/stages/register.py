@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from tilestream.errors import PoseError, RegistrationError, TileNotReadyError, UsageError
+from tilestream.factors.ground import ground_under
 from tilestream.grid import Box, TileKey
 from tilestream.kernels.fixed_order import norms
 from tilestream.label import FINE_CELL, refined_pose, start_errors, start_poses
@@ -83,7 +84,7 @@ class Measuring:
 
 @stage(
     "register",
-    version=2,
+    version=3,
     memory=lambda counts: FIXED_BYTES + BYTES_PER_POINT * counts["points"],
     seconds=0.45,
     columns=START_COLUMNS,
@@ -101,8 +102,11 @@ def register(
     """
     rows: list[pd.DataFrame] = [NO_ROWS]
     facts: dict[str, dict[str, Any]] = {}
-    for sample, scan in scans:
-        place = _place(scan.T_map_lidar) if measuring.true_pose == "log" else {}
+    heights = _lidar_heights(map_part, scans)
+    for (sample, scan), height in zip(scans, heights, strict=True):
+        place: dict[str, float | None] = {"lidar_height": height}
+        if measuring.true_pose == "log":
+            place |= _place(scan.T_map_lidar)
         try:
             seen = scans.seen(scan)
             T_map_true = _true_pose(map_part, seen, measuring)
@@ -112,7 +116,8 @@ def register(
         else:
             which = {"sample": sample.number, "scan": sample.scan, "stamp_ns": scan.stamp_ns}
             rows.append(found.assign(**which))
-            facts[str(sample.number)] = _place(T_map_true) | {"points": points, "reason": ""}
+            place |= _place(T_map_true)
+            facts[str(sample.number)] = place | {"points": points, "reason": ""}
     names = {column.name: column.dtype for column in START_COLUMNS}
     frame = pd.concat(rows, ignore_index=True)[list(names)].astype(names)
     known = {"data_set": canonical(measuring), "store": map_part.store.address}
@@ -144,6 +149,14 @@ def _place(T_map_true: Float64 | None) -> dict[str, float]:
     assert T_map_true is not None  # a drive's scans have a pose
     x, y, z = T_map_true[:3, 3].tolist()
     return {"x": x, "y": y, "z": z, "heading": math.atan2(T_map_true[1, 0], T_map_true[0, 0])}
+
+
+def _lidar_heights(map_part: MapPart, scans: OpenedScans) -> list[float | None]:
+    """How high the lidar is above the ground of the map at each scan [m]; None: not known."""
+    chosen = [sample.scan for sample in scans.wanted.samples]
+    places: Float64 = scans.log.T_map_lidar[chosen, :3, 3]
+    ground, _ = ground_under(places, map_part.store, "lidar")
+    return [None if math.isnan(height) else height for height in (places[:, 2] - ground).tolist()]
 
 
 def _true_pose(map_part: MapPart, scan: Scan, measuring: Measuring) -> Float64:
