@@ -179,9 +179,7 @@ def test_the_run_tells_what_it_did(done: tuple[Path, Told]) -> None:
         "work": 1,
         "core_seconds": 0,
     }
-    heights = [note for note in told["notes"] if "above the ground of the map" in note]
-    assert len(heights) == len(STREETS)  # the routes are the ways of the lidars
-    assert all("2.0 m above" in note for note in heights)
+    assert not any("above the ground of the map" in note for note in told["notes"])
     effective = yaml.safe_load((done[0] / "config.yaml").read_text())
     assert RunSettings(**effective) == RunSettings(**effective | {"spacing": 1.0})
     assert effective["label"]["starts"]["radius"] == 0.4

@@ -132,11 +132,11 @@ def test_the_real_lane_centre_route(shared_data: Path) -> None:
     assert np.isnan(every_metre.positions[:, 2]).all()
 
 
-def test_a_real_log_is_a_route_without_height(shared_data: Path) -> None:
+def test_a_real_log_is_the_way_of_its_lidar(shared_data: Path) -> None:
     path = shared_data / "kitti_drive" / "drive.mcap"
     route = read_route(path)
     assert len(route.positions) == 52
-    assert np.isnan(route.positions[:, 2]).all()
+    assert route.positions[0].tolist() == [0.0, 0.0, 0.0]
     assert route.arc_length[-1] == pytest.approx(71.45, abs=0.1)
     lowered = read_route(path, z_offset=-1.73)
     assert lowered.positions[0, 2] == -1.73

@@ -9,7 +9,7 @@ from tilestream.records import RouteZ
 TOLD_FROM = 0.5
 """Difference of heights from which it is told [m]."""
 LIDAR_TOLD_FROM = 0.3
-"""Difference of the height of a lidar from the settings, from which it is told [m]."""
+"""The same of the height of a lidar and the settings [m]."""
 WHAT_COUNTS = {
     "ground": "the ground counts (route_z)",
     "road": "z counts, as the road (route_z)",
@@ -19,7 +19,7 @@ WHAT_COUNTS = {
 
 
 def notes_of_routes(places: pd.DataFrame, sensor_height: float, route_z: RouteZ) -> list[str]:
-    """A sentence for each route whose heights are not those of the map, or of the settings.
+    """A sentence for each route whose z is neither that of the road in the map nor of the lidar.
 
     Args:
         places: sample points, with `route_id` and `above_ground` [m].
@@ -33,7 +33,8 @@ def notes_of_routes(places: pd.DataFrame, sensor_height: float, route_z: RouteZ)
             continue
         middle, off = float(np.median(known)), off_ground(known, sensor_height, route_z)
         road = middle - (sensor_height if route_z == "lidar" else 0.0)
-        if abs(road) <= TOLD_FROM and not off.any():
+        of_lidar = route_z == "ground" and abs(middle - sensor_height) <= LIDAR_TOLD_FROM
+        if (abs(road) <= TOLD_FROM or of_lidar) and not off.any():
             continue
         side = "above" if middle >= 0.0 else "below"
         told = (

@@ -43,7 +43,7 @@ def read_all_routes(
     project_to: str | None = None,
     map_crs: str | None = None,
     max_jump: float = 1000.0,
-    z_offset: float | None = None,
+    z_offset: float = 0.0,
     pose_topic: str | None = None,
     points_topic: str | None = None,
 ) -> RoutesRead:
@@ -57,7 +57,7 @@ def read_all_routes(
     * `.geojson`, `.json`: every LineString; of a MultiLineString each part;
     * `.osm`: Lanelet2; centre lines of the lanelets for vehicles, joined as long as one follows the
       other without a fork; in `local_x`, `local_y` where every node has them, else degrees;
-    * a log (`.mcap`): its poses, see `logs.open_log`.
+    * a log (`.mcap`): its poses, those of the lidar, see `logs.open_log`.
 
     A route leads through vertices 0.5 m apart or farther (`motion.vertices`), so that a vehicle
     that stands while its poses shake goes nowhere; other points are dropped and counted. A path
@@ -75,8 +75,7 @@ def read_all_routes(
         project_to: a metric CRS (any name that pyproj knows) to project to; None: `map_crs`.
         map_crs: CRS of the map that the routes are for; what names none is in it.
         max_jump: longest distance between successive points [m].
-        z_offset: added to z, so that the route lies on the road: minus the height of the recorded
-            frame. None: z as it is in the file; no z for a log, whose poses are the lidar's.
+        z_offset: added to z, as where heights of the file and of the map are of two systems [m].
         pose_topic: topic of the poses of a log.
         points_topic: topic of the scans of a log, of whose lidar its poses are.
 
@@ -91,7 +90,6 @@ def read_all_routes(
             cannot be used, or that is not the map's and cannot be brought there.
     """
     name = str(path)
-    lift = z_offset or (np.nan if is_log(name) and z_offset is None else 0.0)
     try:
         with foreign_errors(CorruptSourceError, f"{name}: cannot be read as routes"):
             drawn = _drawn(name, pose_topic, points_topic)
@@ -112,7 +110,7 @@ def read_all_routes(
     found: list[Route] = []
     notes: list[str] = list(of_crs)
     for drawn_path, xyz in zip(paths, points, strict=True):
-        parts, told = pieces(replace(drawn_path, positions=xyz + np.array([0.0, 0.0, lift])))
+        parts, told = pieces(replace(drawn_path, positions=xyz + np.array([0.0, 0.0, z_offset])))
         notes += told
         for part in parts:
             where = f"{name}: route {part.route_id}"
@@ -140,7 +138,7 @@ def read_routes(
     project_to: str | None = None,
     map_crs: str | None = None,
     max_jump: float = 1000.0,
-    z_offset: float | None = None,
+    z_offset: float = 0.0,
     pose_topic: str | None = None,
     points_topic: str | None = None,
 ) -> list[Route]:
@@ -177,7 +175,7 @@ def read_route(
     project_to: str | None = None,
     map_crs: str | None = None,
     max_jump: float = 1000.0,
-    z_offset: float | None = None,
+    z_offset: float = 0.0,
     pose_topic: str | None = None,
 ) -> Route:
     """The one route of a file, or the one with this id; otherwise as `read_routes`.
