@@ -26,8 +26,11 @@ import pandas as pd
 from scipy.stats import spearmanr
 
 import tilestream as ts
+from tilestream.model.dataset import nearest_along
 
 CM = 100.0
+REACH = 0.5
+"""How far along its path an estimate may be from a label [m]."""
 
 
 def table(run_dir: Path) -> str:
@@ -35,7 +38,7 @@ def table(run_dir: Path) -> str:
     places = pd.read_parquet(run_dir / "report" / "places.parquet")
     said = places[["route_id", "arc_length", "estimate", "low", "high"]]
     said = said.rename(columns={"route_id": "path"})
-    rows = ts.dataset(run_dir).rows.merge(said, on=["path", "arc_length"], validate="many_to_one")
+    rows = nearest_along(ts.dataset(run_dir).rows, said, REACH).dropna(subset="estimate")
     lines = [
         "| drive | points | measured, mean | median | estimated, median | MAE | Spearman | held |",
         "|---|---|---|---|---|---|---|---|",

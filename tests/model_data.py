@@ -1,6 +1,7 @@
 """Synthetic drives with the paper's error tails: factors and labels that vary smoothly."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -92,10 +93,21 @@ def labels_of(error: Floats) -> dict[str, Floats]:
     }
 
 
+def joined(
+    factors: pd.DataFrame,
+    labels: Mapping[str, pd.DataFrame],
+    columns: Sequence[Column] = COLUMNS,
+    **known: Any,
+) -> Dataset:
+    """Labels whose sample is the row of the factor table that is of their place."""
+    own = factors.assign(sample=factors.index)
+    return join(factors, dict.fromkeys(labels, own), labels, columns, **known)
+
+
 def dataset(seed: int = 0, related: float = 0.7, lengths: dict[str, int] | None = None) -> Dataset:
     """The same, joined."""
     factors, labels = drives(seed, lengths, related)
-    return join(factors, {"drive": labels}, COLUMNS)
+    return joined(factors, {"drive": labels})
 
 
 def unrelated(seed: int) -> Dataset:
@@ -116,4 +128,4 @@ def caused() -> Dataset:
     factors[names] = values
     shape = (values[:, 0] - values[:, -1] + values[:, 9]) / np.sqrt(3.0)
     labels = labels.assign(**labels_of(0.09 * np.exp(0.6 * shape)))
-    return join(factors, {"drive": labels}, COLUMNS)
+    return joined(factors, {"drive": labels})

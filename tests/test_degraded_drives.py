@@ -11,10 +11,9 @@ from streets import job, street, write_drive
 import tilestream as ts
 from tilestream.factors.virtual_drive import AVERAGED, averaged_along
 from tilestream.formats.points.pcd import write_pcd
-from tilestream.formats.routes import read_routes
 from tilestream.pipeline.jobs.run_findings import labels_of
 from tilestream.pipeline.jobs.run_inputs import degraded_drives, inputs_of, observing_of
-from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
+from tilestream.pipeline.jobs.run_plan import plan_measure
 from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.settings import DriveSettings
@@ -23,6 +22,7 @@ from tilestream.tables import read_tables
 
 SHORT, USUAL, OFFSET = 9.0, 14.0, 0.02
 KEYS = ["route_id", "sample"]
+WHERE = ["sample", "arc_length", "heading", "x", "y", "z"]
 
 
 @pytest.fixture(scope="module")
@@ -44,54 +44,56 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> RunSettings:
     return settings
 
 
-def observed(run: RunSettings, range_max: float, out: Path) -> pd.DataFrame:
-    """The observe table of a job whose lidar sees so far."""
-    assert run.observe is not None
-    return ts.observe_along(
-        open_store(run.store_url),
-        read_routes(run.routes[0]),
-        out,
-        spacing=run.spacing,
-        seeing=run.observe.model_copy(update={"range_max": range_max}),
-        registration=run.label.registration,
-    )
-
-
 def tables(folder: Path) -> pd.DataFrame:
-    return read_tables([str(path) for path in sorted(folder.glob("*.parquet"))])
+    found = read_tables([str(path) for path in sorted(folder.glob("*.parquet"))])
+    return found.sort_values("sample", ignore_index=True)
 
 
-def test_a_degraded_drive_is_observed_as_a_job_of_that_lidar_would_be(
-    run: RunSettings, tmp_path: Path
+def own(run: RunSettings, group: str, kind: str) -> pd.DataFrame:
+    return tables(run.folder / "tables" / "drives" / group / kind)
+
+
+@pytest.mark.parametrize(("group", "range_max"), [("short", SHORT), ("whole", USUAL)])
+def test_a_drive_is_looked_from_where_its_scans_were_taken(
+    run: RunSettings, group: str, range_max: float
 ) -> None:
-    of_drive = tables(run.folder / "tables" / "drives" / "9m" / "observability")
-    alone = observed(run, SHORT, tmp_path)
-    assert len(of_drive) == len(alone) > 5
-    order = {"by": KEYS, "ignore_index": True}
-    pd.testing.assert_frame_equal(
-        of_drive.sort_values(**order), alone.sort_values(**order), check_exact=True
+    """With the lidar that it is read as; the factors are of the vehicle's."""
+    labels = tables(run.folder / "tables" / "errors" / group)
+    observed, factors = own(run, group, "observability"), own(run, group, "factors")
+    assert len(labels) > 5
+    for table in (observed, factors):
+        pd.testing.assert_frame_equal(table[WHERE], labels[WHERE], check_exact=True)
+        assert table["above_ground"].tolist() == labels["lidar_height"].tolist()
+    store, at = open_store(run.store_url), labels[["x", "y", "z"]].to_numpy()
+    assert run.observe is not None
+    seeing = run.observe.model_copy(update={"range_max": range_max})
+    alone = ts.observability(
+        store, at, labels["heading"], seeing=seeing, registration=run.label.registration
     )
-    usual = tables(run.folder / "tables" / "observability").sort_values(**order)
-    pd.testing.assert_frame_equal(
-        usual, observed(run, USUAL, tmp_path / "usual").sort_values(**order), check_exact=True
-    )
-    assert (usual["ob_returns"] > alone.sort_values(**order)["ob_returns"]).all()
+    pd.testing.assert_frame_equal(observed[alone.columns], alone, check_exact=True)
+    alone = ts.factors(store, at, which="all")
+    pd.testing.assert_frame_equal(factors[alone.columns], alone, check_exact=True)
+
+
+def test_it_sees_less(run: RunSettings) -> None:
+    short, whole = (own(run, group, "observability") for group in ("short", "whole"))
+    assert (whole["ob_returns"] > short["ob_returns"]).all()
 
 
 def test_its_labels_are_joined_with_that_and_the_estimate_is_of_the_vehicle(
     run: RunSettings,
 ) -> None:
     rows = ts.dataset(run.folder).rows
-    of_drive = tables(run.folder / "tables" / "drives" / "9m" / "observability")
-    usual = tables(run.folder / "tables" / "observability")
     names = list(AVERAGED)
-    for group, table in (("short", of_drive), ("whole", usual)):
-        mine = rows[rows["group"] == group]
-        seen = averaged_along(table).rename(columns={"route_id": "path"})
-        joined = mine[["path", "arc_length"]].merge(seen, on=["path", "arc_length"])
-        assert len(joined) == len(mine) > 5
-        np.testing.assert_array_equal(joined[names], mine[names])
+    for group in ("short", "whole"):
+        mine = rows[rows["group"] == group].set_index("sample")
+        seen = averaged_along(own(run, group, "observability")).set_index("sample")
+        assert len(mine) == len(seen) > 5
+        np.testing.assert_array_equal(mine[names], seen.loc[mine.index, names])
+        assert set(mine["path"]) == {"canyon"}  # the route is the way of the same log
+        np.testing.assert_allclose(mine["arc_length"], seen.loc[mine.index, "arc_length"], atol=0.1)
     places = pd.read_parquet(run.folder / "report" / "places.parquet").set_index(KEYS)
+    usual = tables(run.folder / "tables" / "observability")
     vehicle = averaged_along(usual).set_index(KEYS)["vd_mean"] + OFFSET
     np.testing.assert_array_equal(places["estimate"], vehicle[places.index])
     report = json.loads((run.folder / "report" / "report.json").read_text())
@@ -103,26 +105,27 @@ def test_no_estimate_of_the_vehicle_stands_beside_its_labels(
     run: RunSettings, offset: float | None
 ) -> None:
     places = pd.read_parquet(run.folder / "report" / "places.parquet")
-    found = labels_of(ts.dataset(run.folder), places, None, ["short"], offset).set_index("group")
+    dataset = ts.dataset(run.folder)
+    found = labels_of(dataset, places, None, run.spacing, ["short"], offset).set_index("group")
     short, whole = found.loc["short"], found.loc["whole"]
     if offset is None:  # a model that was trained elsewhere, for the vehicle
         assert short["held_out"].isna().all()
     else:
         np.testing.assert_array_equal(short["held_out"], short["vd_mean"] + OFFSET)
-    np.testing.assert_array_equal(whole["held_out"], whole["vd_mean"] + OFFSET)
+    by_arc = places.set_index("arc_length")["estimate"].sort_index()
+    at = [int(np.abs(by_arc.index - arc).argmin()) for arc in whole["arc_length"]]
+    np.testing.assert_array_equal(whole["held_out"], by_arc.iloc[at])
 
 
-def test_a_job_without_degraded_drives_stays_as_it_is(run: RunSettings) -> None:
+def test_another_drive_changes_nothing_of_the_first(run: RunSettings) -> None:
     plain = run.model_copy(update={"drives": run.drives[:1]})
-    grid, identities = open_store(run.store_url), []
+    store, identities = open_store(run.store_url), []
     for settings in (run, plain):
-        map_plan = MapPlan.of_store(grid)
-        measure = plan_measure(settings, inputs_of(settings, None, None), map_plan)
+        measure = plan_measure(settings, inputs_of(settings, None, None), MapPlan.of_store(store))
         identities.append({t.key: t.identity for t in measure.tasks})
     assert identities[1].items() <= identities[0].items()
-    assert not [key for key in identities[1] if key.startswith("observe_drive")]
-    joined = plan_estimate(plain, grid.grid, measure, []).outputs("samples")
-    assert not any("own_of" in task.takes for task in joined)
+    more = {key.split("-")[0] for key in identities[0].keys() - identities[1].keys()}
+    assert more == {"factors_drive", "observe_drive", "register", "label"}
 
 
 def test_what_a_lidar_cannot_lose_changes_nothing(run: RunSettings) -> None:

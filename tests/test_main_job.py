@@ -518,7 +518,11 @@ def test_nothing_is_learnt_or_estimated_without_the_virtual_drive_that_was_asked
     some = planned(observe[:1])
     assert [str(task.tile) for task in some["predict"]] == tiles[1:]
     (joined,) = some["samples"]
-    assert len(joined.reads["factors"]) == len(joined.reads["observed"]) == len(tiles) - 1
+    assert len(joined.reads["routes"]) == len(tiles) - 1
+    own = [task.key for task in measure.tasks if task.stage == "observe_drive"]
+    (joined,) = planned(own[:1])["samples"]
+    assert len(joined.reads["observed"]) == len(own) - 1
+    assert len(joined.reads["factors"]) == len(own)  # whose labels are counted as lost
     assert planned(observe) == {}
 
 

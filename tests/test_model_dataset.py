@@ -3,13 +3,15 @@
 import numpy as np
 import pandas as pd
 import pytest
-from model_data import COLUMNS, WEAK_AXIS, dataset, drives
+from hypothesis import given
+from hypothesis import strategies as st
+from model_data import COLUMNS, WEAK_AXIS, dataset, drives, joined
 
 from tilestream.errors import ModelError, UsageError
-from tilestream.model.dataset import TARGETS, Dataset, made_with
+from tilestream.model.dataset import TARGETS, Dataset, made_with, nearest_along
 from tilestream.model.evaluation import factor_sets
 from tilestream.model.features import features_of, with_derived
-from tilestream.model.join import PLACE, join
+from tilestream.model.join import NOWHERE, PLACE, join
 from tilestream.model.splits import PROTOCOLS, block_splits, leave_path_out, random_split
 from tilestream.records import Column
 from tilestream.sensor import VLP16
@@ -22,14 +24,12 @@ def short() -> tuple[pd.DataFrame, pd.DataFrame]:
     return drives(3, SHORT)
 
 
-def test_rows_are_joined_by_place_and_not_by_order(
+def test_rows_are_joined_by_sample_and_not_by_order(
     short: tuple[pd.DataFrame, pd.DataFrame],
 ) -> None:
     factors, labels = short
-    rng = np.random.default_rng(0)
-    near = labels.assign(x=labels["x"] + rng.uniform(-0.3, 0.3, len(labels)))
-    plain = join(factors, {"drive": near}, COLUMNS)
-    mixed = join(factors.sample(frac=1.0, random_state=1), {"drive": near[::-1]}, COLUMNS)
+    plain = joined(factors, {"drive": labels})
+    mixed = joined(factors.sample(frac=1.0, random_state=1), {"drive": labels[::-1]})
     pd.testing.assert_frame_equal(plain.rows, mixed.rows, check_exact=True)
     assert len(plain) == sum(SHORT.values())
     want = dict(
@@ -40,36 +40,60 @@ def test_rows_are_joined_by_place_and_not_by_order(
     assert plain.losses == {}
 
 
-def test_a_label_that_finds_no_place_is_counted_with_its_reason(
+def test_a_label_has_the_factors_of_its_own_place_however_far_the_route(
+    short: tuple[pd.DataFrame, pd.DataFrame],
+) -> None:
+    """It is on the route within 5 m, at the arc length there; farther away on a path of its own."""
+    factors, labels = short
+    rng = np.random.default_rng(0)
+    beside = factors.assign(
+        x=factors["x"] + rng.uniform(-0.5, 0.5, len(factors)),
+        y=factors["y"] + rng.uniform(-4.9, 4.9, len(factors)),
+        z=factors["z"] + 3.0,
+        arc_length=factors["arc_length"] + 7.0,
+        sample=factors.index,
+    )
+    found = join(factors, {"drive": beside}, {"drive": labels}, COLUMNS).rows
+    want = beside.sort_values("y").merge(labels, on="sample", suffixes=("", "_label"))
+    assert len(found) == len(factors)
+    found = found.set_index("sample").loc[want["sample"]]
+    for name in ("score_H", "error_mean", "x", "y", "z"):
+        assert found[name].tolist() == want[name].tolist()
+    assert found["path"].tolist() == want["route_id"].tolist()
+    start = factors.groupby("route_id")["x"].min()
+    np.testing.assert_allclose(
+        found["arc_length"], want["x"].to_numpy() - start[want["route_id"]].to_numpy(), atol=1e-6
+    )
+    assert found["distance"].between(0.0, 5.0).all()
+    far = join(factors, {"drive": beside.assign(y=beside["y"] + 20.0)}, {"drive": labels}, COLUMNS)
+    assert set(far.rows["path"]) == {"drive, off the routes"}
+    assert far.rows["distance"].isna().all()
+    assert far.rows["arc_length"].isin(beside["arc_length"]).all()
+
+
+def test_a_label_that_is_not_joined_is_counted_with_its_reason(
     short: tuple[pd.DataFrame, pd.DataFrame],
 ) -> None:
     factors, labels = short[0].copy(), short[1].copy()
     factors.loc[5, "score_H"] = np.nan
     factors.loc[6, ["status", "reason"]] = ["missing", "no map here"]
     labels.loc[10, ["status", "reason"]] = ["failed", "no cell in reach"]
-    labels.loc[20, "y"] += 0.6
-    labels.loc[30, "x"] += 0.5
     labels.loc[40, "error_mean"] = np.nan
-    labels.loc[50, "x"] = labels.loc[51, "x"] + 0.2
-    labels.loc[60, "x"] = np.nan
-    labels.loc[70, "x"] += 0.6
-    labels.loc[71, "x"] -= 0.4
-    found = join(factors, {"drive": labels}, COLUMNS)
+    labels.loc[60, "sample"] = 10_000
+    found = joined(factors, {"drive": labels})
     assert found.losses == {
         "factor score_H is not a number": 1,
-        "no factors at the sample point": 1,
+        NOWHERE: 2,
         "label failed": 1,
-        "no sample point within the tolerance": 1,
-        "two sample points equally near": 1,
         "label error_mean is not a number": 1,
-        "another scan is nearer to the sample point": 1,
-        "label without a position": 1,
-        "two scans equally near to the sample point": 2,
     }
     assert len(found) + sum(found.losses.values()) == len(labels)
-    details = dict(zip(found.lost["reason"], found.lost["detail"], strict=True))
-    assert details["label failed"] == "no cell in reach"
-    assert details["no factors at the sample point"] == "no map here"
+    details = found.lost.set_index("sample")["detail"]
+    assert details[10] == "no cell in reach"
+    assert details[6] == "no map here"
+    assert details[10_000] == "its task failed"
+    nobody = join(factors, {}, {"drive": labels}, COLUMNS)
+    assert nobody.losses == {NOWHERE: len(labels) - 1, "label failed": 1}
 
 
 def test_several_drives_over_one_place_are_kept_apart(
@@ -77,11 +101,11 @@ def test_several_drives_over_one_place_are_kept_apart(
 ) -> None:
     factors, labels = short
     again = labels.assign(error_mean=labels["error_mean"] + 0.01)
-    both = join(factors, {"one": labels, "two": again}, COLUMNS)
+    both = joined(factors, {"one": labels, "two": again}, COLUMNS)
     assert len(both) == 2 * len(labels)
     assert both.rows.groupby("group").size().to_dict() == {"one": len(labels), "two": len(labels)}
     one = both.groups(["one"])
-    assert np.array_equal(one.label(), join(factors, {"one": labels}, COLUMNS).label())
+    assert np.array_equal(one.label(), joined(factors, {"one": labels}, COLUMNS).label())
     with pytest.raises(UsageError, match="no group 'three'; there are one, two"):
         both.groups(["three"])
 
@@ -91,13 +115,13 @@ def test_labels_of_different_making_are_never_mixed(
 ) -> None:
     factors, labels = short
     identities = {"one": {"solver": "raw"}, "two": {"solver": "definite"}}
-    mixed = join(factors, {"one": labels, "two": labels}, COLUMNS, data_sets=identities)
+    mixed = joined(factors, {"one": labels, "two": labels}, COLUMNS, data_sets=identities)
     with pytest.raises(ModelError, match="'one' and 'two' were labelled with different solver"):
         mixed.check()
     mixed.groups(["one"]).check()
     refined = {"one": labels.assign(true_pose="log"), "two": labels.assign(true_pose="refined")}
     with pytest.raises(ModelError, match="different true_pose"):
-        join(factors, refined, COLUMNS).check()
+        joined(factors, refined, COLUMNS).check()
 
 
 def test_position_name_and_heading_are_never_features() -> None:
@@ -107,7 +131,7 @@ def test_position_name_and_heading_are_never_features() -> None:
         WEAK_AXIS,
         *(Column(name, "place", "m", "", "") for name in PLACE),
     )
-    found = join(factors, {"drive": labels}, catalogue)
+    found = joined(factors, {"drive": labels}, catalogue)
     assert not {*PLACE, "path", "block", "group", "sample", "distance", "weak_axis"} & set(
         found.names
     )
@@ -116,7 +140,7 @@ def test_position_name_and_heading_are_never_features() -> None:
     turned = factors.assign(heading=factors["heading"] + 1.0, weak_axis=factors["weak_axis"] + 1.0)
     elsewhere = turned.assign(x=turned["x"] + 5e4, route_id="other " + turned["route_id"])
     moved = labels.assign(x=labels["x"] + 5e4)
-    there = join(elsewhere, {"drive": moved}, catalogue)
+    there = joined(elsewhere, {"drive": moved}, catalogue)
     assert np.allclose(there.matrix(), found.matrix(), rtol=0, atol=1e-12)
     assert [c.name for c in features_of(catalogue)] == found.names
 
@@ -146,8 +170,10 @@ def test_blocks_are_at_least_200_m_and_whole_paths_if_shorter() -> None:
 
 def test_blocks_do_not_depend_on_what_was_lost(short: tuple[pd.DataFrame, pd.DataFrame]) -> None:
     factors, labels = short
-    whole = join(factors, {"drive": labels}, COLUMNS).rows.set_index(["path", "arc_length"])
-    part = join(factors, {"drive": labels[100:500]}, COLUMNS).rows.set_index(["path", "arc_length"])
+    whole = joined(factors, {"drive": labels}, COLUMNS).rows.set_index(["path", "arc_length"])
+    part = joined(factors, {"drive": labels[100:500]}, COLUMNS).rows.set_index(
+        ["path", "arc_length"]
+    )
     assert (part["block"] == whole.loc[part.index, "block"]).all()
 
 
@@ -170,7 +196,7 @@ def test_a_street_driven_twice_is_no_other_street() -> None:
     beside = factors["route_id"] == "b"
     factors.loc[beside, "y"] = factors["y"].iloc[0] + 5.0
     labels["y"] = factors["y"]
-    found = join(factors, {"drive": labels}, COLUMNS)
+    found = joined(factors, {"drive": labels}, COLUMNS)
     with pytest.raises(ModelError, match="path a: 0 points lie beyond 100 m"):
         leave_path_out(found)
 
@@ -211,17 +237,17 @@ def test_what_factors_were_made_with_is_remembered() -> None:
 
 def small(**changes: object) -> Dataset:
     factors, labels = drives(0, {"a": 60, "b": 60})
-    return join(factors, {"drive": labels.assign(**changes)}, COLUMNS)
+    return joined(factors, {"drive": labels.assign(**changes)}, COLUMNS)
 
 
 def test_what_nothing_can_be_learnt_from_is_refused() -> None:
     with pytest.raises(ModelError, match=r"error_mean is 0\.1 at all 120 points"):
         small(error_mean=0.1).check()
     factors, labels = drives(0, {"a": 60, "b": 60})
-    few = join(factors, {"drive": labels.iloc[:49]}, COLUMNS)
+    few = joined(factors, {"drive": labels.iloc[:49]}, COLUMNS)
     with pytest.raises(ModelError, match="49 labelled points, and a model needs 50"):
         few.check()
-    lonely = join(factors, {"drive": labels}, COLUMNS).take(np.arange(61))
+    lonely = joined(factors, {"drive": labels}, COLUMNS).take(np.arange(61))
     with pytest.raises(ModelError, match="path 'b' has one point only"):
         lonely.check()
     with pytest.raises(ModelError, match="one block only"):
@@ -234,44 +260,84 @@ def test_what_nothing_can_be_learnt_from_is_refused() -> None:
 
 def test_a_label_alone_on_its_path_is_lost_and_stops_nothing() -> None:
     factors, labels = drives(0, {"a": 60, "b": 60})
-    end = join(factors, {"drive": labels.iloc[:61]}, COLUMNS)
+    end = joined(factors, {"drive": labels.iloc[:61]}, COLUMNS)
     end.check()
     assert len(end) == 60
     assert end.losses == {"the only label of its path": 1}
     assert end.lost["sample"].tolist() == [60]
     twice = {"one": labels.iloc[:61], "two": labels.iloc[60:61]}
-    assert join(factors, twice, COLUMNS).losses == {"the only label of its path": 2}
+    assert joined(factors, twice, COLUMNS).losses == {"the only label of its path": 2}
     apart = {"one": labels.iloc[:61], "two": labels.iloc[60:62]}
-    assert join(factors, apart, COLUMNS).losses == {}
-    nothing = join(factors, {"drive": labels.iloc[[3]]}, COLUMNS)
+    assert joined(factors, apart, COLUMNS).losses == {}
+    nothing = joined(factors, {"drive": labels.iloc[[3]]}, COLUMNS)
     with pytest.raises(ModelError, match=r"0 labelled points.*1 the only label of its path"):
         nothing.check()
 
 
+def test_each_path_is_that_of_the_drive_that_knows_most_of_it(
+    short: tuple[pd.DataFrame, pd.DataFrame],
+) -> None:
+    factors, labels = short
+    groups = {"one": labels.iloc[:400], "two": labels.iloc[150:]}
+    once = joined(factors, groups).each_path_once().rows
+    counts = once.groupby(["path", "group"]).size().to_dict()
+    assert counts == {("a", "one"): 260, ("b", "two"): 410, ("c", "two"): 90}
+
+
+@given(
+    st.lists(st.tuples(st.sampled_from("ab"), st.floats(0.0, 50.0)), min_size=1, max_size=12),
+    st.lists(
+        st.tuples(st.sampled_from("ab"), st.integers(0, 50)), min_size=1, max_size=12, unique=True
+    ),
+    st.floats(0.0, 5.0),
+)
+def test_the_nearest_along_a_path_is_that_of_a_search(
+    rows: list[tuple[str, float]], others: list[tuple[str, int]], reach: float
+) -> None:
+    left = pd.DataFrame(rows, columns=["path", "arc_length"])
+    right = pd.DataFrame(others, columns=["path", "arc_length"]).astype({"arc_length": float})
+    found = nearest_along(left, right.assign(at=right["arc_length"]), reach)
+    assert found[["path", "arc_length"]].equals(left)
+    for (path, arc), at in zip(rows, found["at"], strict=True):
+        apart = [abs(other - arc) for way, other in others if way == path]
+        if apart and min(apart) <= reach:
+            assert abs(at - arc) == min(apart)
+        else:
+            assert np.isnan(at)
+
+
 def test_broken_tables_are_refused(short: tuple[pd.DataFrame, pd.DataFrame]) -> None:
     factors, labels = short
+    own = {"drive": factors.assign(sample=factors.index)}
     with pytest.raises(UsageError, match=r"two rows of route 'a' at 0 m"):
-        join(pd.concat([factors, factors.iloc[:1]]), {"drive": labels}, COLUMNS)
+        join(pd.concat([factors, factors.iloc[:1]]), own, {"drive": labels}, COLUMNS)
     with pytest.raises(UsageError, match="group 'drive' has sample 0 twice"):
-        join(factors, {"drive": pd.concat([labels, labels.iloc[:1]])}, COLUMNS)
-    with pytest.raises(UsageError, match="the factor table has no column heading"):
-        join(factors.drop(columns="heading"), {"drive": labels}, COLUMNS)
+        joined(factors, {"drive": pd.concat([labels, labels.iloc[:1]])})
+    twice = {"drive": pd.concat([own["drive"], own["drive"].iloc[:1]])}
+    with pytest.raises(UsageError, match="group 'drive' has the factors of sample 0 twice"):
+        join(factors, twice, {"drive": labels}, COLUMNS)
+    with pytest.raises(UsageError, match="the table of routes has no column heading"):
+        join(factors.drop(columns="heading"), own, {"drive": labels}, COLUMNS)
     with pytest.raises(UsageError, match="group 'drive' has no column error_mean"):
-        join(factors, {"drive": labels.drop(columns="error_mean")}, COLUMNS)
+        joined(factors, {"drive": labels.drop(columns="error_mean")})
     with pytest.raises(UsageError, match="none of the catalogue's factors"):
-        join(factors[[*PLACE, "status", "reason"]], {"drive": labels}, COLUMNS)
-    with pytest.raises(UsageError, match="the factor table has no rows"):
-        join(factors.iloc[:0], {"drive": labels}, COLUMNS)
-    with pytest.raises(UsageError, match="give positive lengths"):
-        join(factors, {"drive": labels}, COLUMNS, tolerance=0.0)
+        joined(factors[[*PLACE, "status", "reason"]], {"drive": labels})
+    with pytest.raises(UsageError, match="the table of routes has no rows"):
+        joined(factors.iloc[:0], {"drive": labels})
+    with pytest.raises(UsageError, match="give a positive length"):
+        joined(factors, {"drive": labels}, block=0.0)
 
 
 def test_no_labels_is_an_empty_table_that_says_so(
     short: tuple[pd.DataFrame, pd.DataFrame],
 ) -> None:
     factors, labels = short
-    for groups in ({}, {"drive": labels.iloc[:0]}, {"drive": labels.assign(x=0.0)}):
-        found = join(factors, groups, COLUMNS)
+    for groups in (
+        {},
+        {"drive": labels.iloc[:0]},
+        {"drive": labels.assign(sample=-1 - labels["sample"])},
+    ):
+        found = joined(factors, groups, COLUMNS)
         assert len(found) == 0
         with pytest.raises(ModelError, match="0 labelled points"):
             found.check()

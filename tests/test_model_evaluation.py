@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from model_data import COLUMNS, caused, dataset, drives, unrelated
+from model_data import COLUMNS, caused, dataset, drives, joined, unrelated
 
 from tilestream.errors import ModelError
 from tilestream.model.evaluation import (
@@ -26,7 +26,6 @@ from tilestream.model.evaluation import (
 )
 from tilestream.model.forest import Growth, PaperForest
 from tilestream.model.intervals import calibrate, coverage
-from tilestream.model.join import join
 from tilestream.model.splits import block_splits, leave_path_out, random_split
 
 QUICK = Growth(trees=20)
@@ -110,7 +109,7 @@ def test_a_protocol_that_cannot_be_followed_says_why() -> None:
 def test_the_ceiling_is_a_repeated_drive() -> None:
     factors, labels = drives(1, {"a": 200})
     again = labels.assign(error_mean=labels["error_mean"] + 0.01)
-    both = join(factors, {"one": labels, "two": again}, COLUMNS)
+    both = joined(factors, {"one": labels, "two": again}, COLUMNS)
     found = ceiling(both)
     assert found.points == 400
     assert found.mae == pytest.approx(0.01)

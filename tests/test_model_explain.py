@@ -5,13 +5,12 @@ from dataclasses import asdict, replace
 import numpy as np
 import pandas as pd
 import pytest
-from model_data import COLUMNS, drives
+from model_data import COLUMNS, drives, joined
 from scipy.stats import spearmanr
 
 from tilestream.model.explain import SHARES, UNITS, Typical, compared, in_words, typical_of
 from tilestream.model.features import features_of
 from tilestream.model.forest import DefaultForest, Growth
-from tilestream.model.join import join
 from tilestream.model.phrases import PHRASES, REASSURING, phrase_of
 from tilestream.model.training import predict, train
 from tilestream.pipeline.stages.predict import physical
@@ -142,7 +141,7 @@ def test_the_worst_places_name_a_cause_in_the_map() -> None:
     factors["vd_mean"] = error * np.exp(0.05 * rng.normal(size=len(error)))
     factors["ob_info_along"] = 500.0 / error * np.exp(rng.normal(size=len(error)))
     factors["angular_H"] = 5.0 - np.log(error) + 0.4 * rng.normal(size=len(error))
-    learnt = join(factors, {"drive": labels}, (*COLUMNS, *seen))
+    learnt = joined(factors, {"drive": labels}, (*COLUMNS, *seen))
     with pytest.MonkeyPatch.context() as patch:
         growth = asdict(Growth(trees=10, leaf=8, log=True))
         patch.setattr(DefaultForest, "tuned", lambda *_: growth)

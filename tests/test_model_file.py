@@ -18,7 +18,7 @@ from fuzz_bombs import one_member_more, with_content
 from fuzz_mutations import zipped
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from model_data import COLUMNS, dataset, drives
+from model_data import COLUMNS, dataset, drives, joined
 from sklearn.linear_model import LinearRegression
 
 from tilestream.errors import ModelError, SourceNotFoundError, UsageError
@@ -27,7 +27,6 @@ from tilestream.model.dataset import TARGETS, Dataset, made_with
 from tilestream.model.domain import domain_of
 from tilestream.model.file import load_model, save_model
 from tilestream.model.forest import Growth, PaperForest
-from tilestream.model.join import join
 from tilestream.model.training import PREDICTION_COLUMNS, Model, predict, train
 from tilestream.sensor import HDL64, VLP16
 
@@ -83,7 +82,7 @@ def test_the_same_model_from_rows_in_any_order(monkeypatch: pytest.MonkeyPatch) 
     factors, labels = drives(4, {"a": 150, "b": 220})
     mixed = factors.sample(frac=1.0, random_state=0), labels.sample(frac=1.0, random_state=1)
     one, two = (
-        predict(train(join(f, {"drive": x}, COLUMNS), recipe="paper"), factors)
+        predict(train(joined(f, {"drive": x}, COLUMNS), recipe="paper"), factors)
         for f, x in ((factors, labels), mixed)
     )
     pd.testing.assert_frame_equal(one, two, check_exact=True)
@@ -316,7 +315,7 @@ def test_bad_training_is_refused(learnt: Dataset) -> None:
 
 def test_the_default_model_is_tuned_and_calibrated() -> None:
     factors, labels = drives(9, {"a": 210, "b": 210}, related=0.9)
-    found = join(factors, {"drive": labels}, COLUMNS[:4])
+    found = joined(factors, {"drive": labels}, COLUMNS[:4])
     made = train(found, recipe="default")
     assert made.facts["log"]
     assert made.interval.blocks == 2

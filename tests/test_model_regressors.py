@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import skops.io
-from model_data import COLUMNS, caused, dataset, drives, unrelated
+from model_data import COLUMNS, caused, dataset, drives, joined, unrelated
 from sklearn.ensemble import RandomForestRegressor
 
 from tilestream.errors import ModelError
@@ -17,7 +17,6 @@ from tilestream.model.dataset import Dataset
 from tilestream.model.evaluation import figures_of, held_out
 from tilestream.model.features import with_derived
 from tilestream.model.forest import CANDIDATES, CAUTIOUS, DefaultForest, Growth, PaperForest
-from tilestream.model.join import join
 from tilestream.model.registry import COMPETITORS, REGRESSORS
 from tilestream.model.splits import Split, leave_path_out
 from tilestream.records import Column
@@ -109,7 +108,7 @@ def test_a_forest_of_logarithms_is_near_the_median() -> None:
     factors, labels = drives(1, {"a": 300, "b": 300})
     rng = np.random.default_rng(1)
     labels["error_mean"] = 0.1 * np.exp(rng.normal(size=len(labels)))
-    found = join(factors, {"drive": labels}, COLUMNS)
+    found = joined(factors, {"drive": labels}, COLUMNS)
     estimate = {}
     for log in (False, True):
         growth = asdict(replace(QUICK, leaf=150, log=log))

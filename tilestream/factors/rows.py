@@ -1,13 +1,12 @@
 """Columns that every table of sample points has: the place first, status and reason last."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from tilestream.errors import UsageError
 from tilestream.factors.sample_points import raised
@@ -61,7 +60,7 @@ class Samples:
     """The sample points of one tile, on the road: 48 bytes each, so that a plan can hold a city."""
 
     route_ids: tuple[str, ...]
-    """Names of the routes that they lie on."""
+    """Names of the routes, or of the drives, that they lie on."""
     rows: NDArray[np.void]
     """(k,) of type `ROW`, route by route and along each."""
 
@@ -72,11 +71,6 @@ class Samples:
     def places(self) -> Float64:
         """(k, 2) x and y [m, map frame]."""
         return np.column_stack([self.rows["x"], self.rows["y"]])
-
-    def near(self, places: Float64, reach: float) -> "Samples":
-        """Those within `reach` [m] of any of (n, 2) places, horizontally."""
-        distance, _ = cKDTree(places).query(self.places)
-        return replace(self, rows=self.rows[distance <= reach])
 
     def facts(self) -> list[Any]:
         """The content as JSON values: part of the identity of tables that are made from it."""
@@ -101,13 +95,40 @@ def samples_by_tile(
         raise UsageError(
             f"routes are named {', '.join(names) or 'nothing'}: give each its own name"
         )
+    return _by_tile(grid, ((each.route_id, _rows_of(resample(each, spacing))) for each in routes))
+
+
+def samples_of_drive(
+    grid: TileGrid, name: str, numbers: Int64, arc_length: Float64, T_map_lidar: Float64
+) -> dict[TileKey, Samples]:
+    """The places of the scans of a drive, as sample points by the tile that holds them.
+
+    Their z is that of the lidar (`RouteZ`), their heading that of its x axis.
+
+    Args:
+        grid: the tiles.
+        name: of the drive, in place of a route's.
+        numbers: (k,) of the sample points along the drive.
+        arc_length: (k,) length of the drive up to them [m].
+        T_map_lidar: (k, 4, 4) their poses.
+    """
+    rows = np.zeros(len(numbers), ROW)
+    rows["sample"], rows["arc_length"] = numbers, arc_length
+    rows["heading"] = np.arctan2(T_map_lidar[:, 1, 0], T_map_lidar[:, 0, 0])
+    rows["x"], rows["y"], rows["z"] = T_map_lidar[:, :3, 3].T
+    return _by_tile(grid, [(name, rows)])
+
+
+def _by_tile(
+    grid: TileGrid, named: Iterable[tuple[str, NDArray[np.void]]]
+) -> dict[TileKey, Samples]:
+    """The rows of several routes by the tile that holds them, sorted by tile."""
     pieces: dict[TileKey, list[tuple[str, NDArray[np.void]]]] = {}
-    for route in routes:
-        rows = _rows_of(resample(route, spacing))
-        keys = _keys_of(grid, rows, route.route_id)
+    for name, rows in named:
+        keys = _keys_of(grid, rows, name)
         turns = np.flatnonzero((keys[1:] != keys[:-1]).any(axis=1)) + 1
         for key, piece in zip(keys[[0, *turns]].tolist(), np.split(rows, turns), strict=True):
-            pieces.setdefault(TileKey(*key), []).append((route.route_id, piece))
+            pieces.setdefault(TileKey(*key), []).append((name, piece))
     return {key: _samples_of(pieces.pop(key)) for key in sorted(pieces)}
 
 

@@ -34,8 +34,8 @@ class Dataset:
     """Labelled sample points: a row per drive (group) and place, in one order whatever came in.
 
     The columns of `rows` are `group` (log and sensor), `path`, `block`, `arc_length` [m], `x`, `y`,
-    `z` [m, map frame], `heading` [rad], `distance` [m] between scan and sample point, the factors,
-    and the labels. Rows of one place have the same path and arc length in all groups.
+    `z` [m, map frame], `heading` [rad], `distance` [m] of the place from its path, the factors, and
+    the labels.
     """
 
     rows: pd.DataFrame
@@ -43,7 +43,7 @@ class Dataset:
     columns: tuple[Column, ...]
     """The factors that are features of a model; never a position, a heading or a name."""
     lost: pd.DataFrame
-    """The labels that found no place: group, sample, reason, detail; and the unlabelled places."""
+    """The labels that are not joined: group, sample, reason, detail."""
     made_with: Mapping[str, Any] = field(default_factory=dict)
     """What the factors were computed with; see `made_with`."""
     data_sets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -82,12 +82,17 @@ class Dataset:
         """These rows only."""
         return replace(self, rows=self.rows.iloc[which].reset_index(drop=True))
 
-    def first_drives(self) -> "Dataset":
-        """Each place once, as the first of its groups by name has it: for evaluations.
+    def each_path_once(self) -> "Dataset":
+        """Each path as the drive has it with the most labels there (equal: the first by name): for
+        evaluations.
 
         With a repeated drive a random split would put the same place on both sides.
         """
-        return self.take(np.flatnonzero(~self.rows.duplicated(["path", "arc_length"])))
+        counts = self.rows.groupby(["path", "group"], as_index=False).size()
+        order = counts.sort_values(["path", "size", "group"], ascending=[True, False, True])
+        most = order.drop_duplicates("path").set_index("path")["group"]
+        chosen = self.rows["path"].map(most) == self.rows["group"]
+        return self.take(np.flatnonzero(chosen.to_numpy()))
 
     def groups(self, names: Sequence[str]) -> "Dataset":
         """The rows of these groups only.
@@ -143,6 +148,30 @@ class Dataset:
             if len(kinds) > 1:
                 raise ModelError(f"labels of different {name} ({', '.join(kinds)}): choose groups")
         _one_identity(self.data_sets)
+
+
+def nearest_along(rows: pd.DataFrame, others: pd.DataFrame, reach: float) -> pd.DataFrame:
+    """Rows with the columns that they lack of the nearest of other rows along the same path.
+
+    Args:
+        rows: with `path` and `arc_length` [m].
+        others: likewise, no two at one place; what is farther along than `reach` [m] is not taken.
+        reach: see there.
+
+    Returns:
+        The rows in their order; NaN where there is none within reach.
+    """
+    own = rows.sort_values("arc_length", kind="stable")
+    kept = [name for name in others if name in ("path", "arc_length") or name not in rows]
+    found = pd.merge_asof(
+        own,
+        others[kept].sort_values("arc_length", kind="stable"),
+        on="arc_length",
+        by="path",
+        direction="nearest",
+        tolerance=reach,  # type: ignore[arg-type]  # the stubs know integers only
+    )
+    return found.set_index(own.index).reindex(rows.index)
 
 
 def matrix(places: pd.DataFrame, names: Sequence[str]) -> Float64:

@@ -1,79 +1,76 @@
-"""Factors and errors of the same places, joined: what finds no partner is kept with its reason."""
+"""Labels and the factors of their places, joined: what finds none is kept with its reason."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from tilestream.errors import UsageError
 from tilestream.model.dataset import TARGETS, Dataset
 from tilestream.model.features import features_of, with_derived
-from tilestream.records import Column, Float64, Int64
+from tilestream.records import Column, Float64
 
 PLACE = ("route_id", "arc_length", "x", "y", "z", "heading")
 """Columns that say where a row is; never features."""
-TOLERANCE = 0.5
-"""How far a scan may be from the sample point whose factors it gets [m]: half the spacing."""
+ON_PATH = 5.0
+"""How far from a route a place lies on it, horizontally [m]."""
 BLOCK = 200.0
 """Least length of a block [m]: twice the range of a vicinity."""
-SAME = 1e-3
-"""Distances this close are equal [m]: the resolution of the map."""
 LONE = "the only label of its path"
 """Why a label alone on its path is lost."""
+NOWHERE = "no factors at its place"
+"""Why a label is lost whose place could not be looked from."""
 
 
 def join(
-    factors: pd.DataFrame,
+    routes: pd.DataFrame,
+    factors: Mapping[str, pd.DataFrame],
     labels: Mapping[str, pd.DataFrame],
     columns: Sequence[Column],
     *,
-    own_factors: Mapping[str, pd.DataFrame] | None = None,
-    tolerance: float = TOLERANCE,
     block: float = BLOCK,
     made_with: Mapping[str, Any] | None = None,
     data_sets: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> Dataset:
-    """Join factors and labels by place: each label gets the factors of the nearest sample point.
+    """Join each label with the factors of its own place, and name the path that it lies on.
 
-    Every label that is not joined is counted with its reason: it failed, a value is NaN, no sample
-    point within the tolerance, two sample points equally near (within 1 mm), another scan of its
-    group nearer to that sample point, or no other labelled place on its path: the end of a side
-    street makes no path that could be held out.
+    The path is the route that is nearest, if within 5 m horizontally, and `arc_length` that of the
+    route there; else the drive itself. Every label that is not joined is counted with its reason:
+    it failed, a value is NaN, no factors at its place, or no other labelled place on its path: the
+    end of a side street makes no path that could be held out.
 
     Args:
-        factors: the factor table: place columns (`PLACE`), factors, `status` and `reason`.
-        labels: the label tables (`x`, `y`, `z`, `sample`, `TARGETS`, `status`, …) by the name of
-            their group: one log as seen by one sensor.
-        columns: the catalogue of the factors; those absent from the table are no features.
-        own_factors: the factor tables, of the same places, of groups that were seen with another
-            lidar.
-        tolerance: farthest sample point that a label takes its factors from [m].
+        routes: sample points of the routes: place columns (`PLACE`).
+        factors: by the name of a group (one log as seen by one sensor), the factor table of the
+            places of its scans: place columns, `sample`, factors, `status` and `reason`.
+        labels: by group, the label table (`x`, `y`, `z`, `sample`, `TARGETS`, `status`, …).
+        columns: the catalogue of the factors; those that no table has are no features.
         block: least length of a block along a path [m]; a shorter path is one block.
         made_with: what the factors were computed with (`made_with`).
         data_sets: the identity of each group's labels, as their tables carry it.
 
     Raises:
-        UsageError: columns that a table lacks, a table with a row twice, a tolerance or block that
-            is not positive, no rows or no factor in the factor table.
+        UsageError: columns that a table lacks, a table with a row twice, a block that is not
+            positive, no routes, or no factor in the factor tables.
     """
-    if not (tolerance > 0.0 and block > 0.0):
-        raise UsageError(f"tolerance {tolerance!r} and block {block!r}: give positive lengths")
-    places = _places(factors, block)
-    features = tuple(c for c in features_of(columns) if c.name in places)
-    if not features:
-        raise UsageError("the factor table has none of the catalogue's factors")
-    seen = {name: _places(table, block) for name, table in (own_factors or {}).items()}
-    joined = [
-        _joined(seen.get(name, places), name, labels[name], tolerance) for name in sorted(labels)
-    ]
-    table = pd.concat(joined or [_joined(places, "", _NO_LABELS, tolerance)], ignore_index=True)
+    if not block > 0.0:
+        raise UsageError(f"block {block!r}: give a positive length")
+    paths = _paths(routes)
+    seen = {name: with_derived(table) for name, table in factors.items()}
+    there = {column for table in seen.values() for column in table}
+    features = tuple(column for column in features_of(columns) if column.name in there)
+    if seen and not features:
+        raise UsageError("the factor tables have none of the catalogue's factors")
+    joined = [_joined(name, seen.get(name), labels[name]) for name in sorted(labels)]
+    table = pd.concat(joined or [_joined("", None, _NO_LABELS)], ignore_index=True)
+    table = _with_paths(table, paths)
+    table = table.assign(block=_blocks(table, paths, block))
     table = _without_lone(_checked(table, [column.name for column in features]))
     kept = table[table["reason"] == ""]
     order = ["group", "path", "arc_length", "x", "y", "z"]
-    rows = kept.drop(columns=["reason", "detail", "status"]).sort_values(order, kind="stable")
+    rows = kept.drop(columns=["reason", "detail"]).sort_values(order, kind="stable")
     lost = table.loc[table["reason"] != "", ["group", "sample", "reason", "detail"]]
     return Dataset(
         rows.reset_index(drop=True),
@@ -85,109 +82,103 @@ def join(
 
 
 _LABELLED = ("sample", "x", "y", "z", "error_mean", "status", "reason")
-_NO_LABELS = pd.DataFrame({name: [] for name in _LABELLED})
+_NO_LABELS = pd.DataFrame({name: [] for name in (*_LABELLED, "arc_length", "heading")})
 
 
-def _places(factors: pd.DataFrame, block: float) -> pd.DataFrame:
-    """The sample points in one order, with path and block."""
-    _require(factors, (*PLACE, "status", "reason"), "the factor table")
-    if factors.empty:
-        raise UsageError("the factor table has no rows: no sample points on this map?")
-    twice = factors.duplicated(["route_id", "arc_length"])
+def _paths(routes: pd.DataFrame) -> pd.DataFrame:
+    """The sample points of the routes: path, arc length, place."""
+    _require(routes, PLACE, "the table of routes")
+    if routes.empty:
+        raise UsageError("the table of routes has no rows: no sample points on this map?")
+    twice = routes.duplicated(["route_id", "arc_length"])
     if twice.any():
-        row = factors[twice].iloc[0]
+        row = routes[twice].iloc[0]
         raise UsageError(
-            f"the factor table has two rows of route {row['route_id']!r} at "
+            f"the table of routes has two rows of route {row['route_id']!r} at "
             f"{row['arc_length']:g} m: was a file read twice?"
         )
-    table = with_derived(factors).rename(
-        columns={"route_id": "path", "status": "factor_status", "reason": "factor_reason"}
+    table = routes[list(PLACE)].rename(columns={"route_id": "path"})
+    table = table.assign(path=table["path"].astype(str))
+    return table.sort_values(["path", "arc_length"], kind="stable").reset_index(drop=True)
+
+
+def _joined(group: str, factors: pd.DataFrame | None, labels: pd.DataFrame) -> pd.DataFrame:
+    """The labels of one group with the factors of their places, and why a row cannot be joined."""
+    _require(labels, _LABELLED, f"group {group!r}")
+    for table, what in ((labels, "sample"), (factors, "the factors of sample")):
+        if table is not None and table["sample"].duplicated().any():
+            sample = table.loc[table["sample"].duplicated(), "sample"].iloc[0]
+            raise UsageError(f"group {group!r} has {what} {sample} twice: was a file read twice?")
+    labels = labels.sort_values("sample", kind="stable").reset_index(drop=True)
+    kept = [n for n in (*TARGETS, "sample", "true_pose", "as_sensor") if n in labels]
+    measured = pd.DataFrame({"true_pose": "", "as_sensor": ""}, index=labels.index)
+    measured = measured.assign(label_status=labels["status"], label_reason=labels["reason"])
+    measured[kept] = labels[kept]
+    if factors is None:
+        here = labels.reindex(columns=["sample", *PLACE[1:]])
+        here = here.assign(status="failed", reason="its task failed")
+    else:
+        _require(factors, (*PLACE, "sample", "status", "reason"), f"the factor table of {group!r}")
+        here = factors.drop(columns="route_id")
+    table = measured.merge(here, on="sample", how="left", validate="one_to_one")
+    failed = (table["label_status"] != "done").to_numpy()
+    blind = (table["status"] != "done").to_numpy()
+    why = table["reason"].fillna("its task failed").astype(str).to_numpy(object)
+    return table.assign(
+        group=group,
+        reason=np.where(failed, "label failed", np.where(blind, NOWHERE, "")),
+        detail=np.where(failed, table["label_reason"].astype(str), np.where(blind, why, "")),
+    ).drop(columns=["label_status", "label_reason", "status"])
+
+
+def _with_paths(table: pd.DataFrame, paths: pd.DataFrame) -> pd.DataFrame:
+    """With the path that each place lies on, the arc length there, and its distance from it [m]."""
+    at = table[["x", "y"]].to_numpy(np.float64)
+    known = np.isfinite(at).all(axis=1)
+    route = paths[["x", "y"]].to_numpy(np.float64)
+    distance, nearest = np.full(len(at), np.inf), np.zeros(len(at), np.int64)
+    if known.any():
+        tree = cKDTree(route - route[0])
+        distance[known], nearest[known] = tree.query(at[known] - route[0])
+    row = paths.iloc[nearest].reset_index(drop=True)
+    ahead = _ahead(at - route[nearest], row["heading"].to_numpy(np.float64))
+    on = distance <= ON_PATH
+    own = table["arc_length"].to_numpy(np.float64)
+    return table.assign(
+        path=np.where(on, row["path"], table["group"].astype(str) + ", off the routes"),
+        arc_length=np.where(on, row["arc_length"].to_numpy(np.float64) + ahead, own),
+        distance=np.where(on, distance, np.nan),
     )
-    table = table.assign(path=table["path"].astype(str)).drop(columns="sample", errors="ignore")
-    table = table.sort_values(["path", "arc_length"], kind="stable").reset_index(drop=True)
-    return table.assign(block=_blocks(table, block))
 
 
-def _blocks(table: pd.DataFrame, block: float) -> list[str]:
-    """`<path>#<number>`: each path cut into equal pieces, none shorter than `block`."""
-    arc = table["arc_length"]
-    start = arc.groupby(table["path"]).transform("min")
-    length = arc.groupby(table["path"]).transform("max") - start
+def _ahead(offset: Float64, heading: Float64) -> Float64:
+    """(k,) how far (k, 2) offsets lead along headings."""
+    ahead: Float64 = offset[:, 0] * np.cos(heading) + offset[:, 1] * np.sin(heading)
+    return ahead
+
+
+def _blocks(table: pd.DataFrame, paths: pd.DataFrame, block: float) -> list[str]:
+    """`<path>#<number>`: each path cut into equal pieces, none shorter than `block`; a path is as
+    long as its route, else as the drive.
+    """
+    ways = pd.concat([paths, table[~table["path"].isin(paths["path"])]])[["path", "arc_length"]]
+    ends = ways.groupby("path")["arc_length"].agg(["min", "max"])
+    start = table["path"].map(ends["min"]).to_numpy(np.float64)
+    length = np.nan_to_num(table["path"].map(ends["max"] - ends["min"]).to_numpy(np.float64))
     pieces = np.maximum(np.floor(length / block), 1.0)
-    number = np.minimum(
-        np.floor((arc - start) * pieces / length.where(length > 0, 1.0)), pieces - 1
-    )
+    share = (table["arc_length"].to_numpy(np.float64) - start) / np.where(length > 0, length, 1.0)
+    number = np.clip(np.floor(np.nan_to_num(share * pieces)), 0.0, pieces - 1.0)
     return [f"{path}#{int(k):02d}" for path, k in zip(table["path"], number, strict=True)]
 
 
-def _joined(
-    places: pd.DataFrame, group: str, labels: pd.DataFrame, tolerance: float
-) -> pd.DataFrame:
-    """The labels of one group with the columns of their place, and why a row cannot be joined."""
-    _require(labels, _LABELLED, f"group {group!r}")
-    if labels["sample"].duplicated().any():
-        sample = labels.loc[labels["sample"].duplicated(), "sample"].iloc[0]
-        raise UsageError(f"group {group!r} has sample {sample} twice: was a file read twice?")
-    labels = labels.sort_values("sample", kind="stable").reset_index(drop=True)
-    failed = (labels["status"] != "done").to_numpy()
-    detail = labels["reason"].where(failed, "").astype(str)
-    reason = np.where(failed, "label failed", "").astype(object)
-    at = labels[["x", "y", "z"]].to_numpy(np.float64)
-    reason[(reason == "") & ~np.isfinite(at).all(axis=1)] = "label without a position"
-    distance, second, place = _nearest(places[["x", "y", "z"]].to_numpy(np.float64), at)
-    open_ = reason == ""
-    reason[open_ & ~(distance <= tolerance)] = "no sample point within the tolerance"
-    reason[(reason == "") & (second <= distance + SAME)] = "two sample points equally near"
-    _nearest_scan_only(reason, place, distance)
-    kept = [n for n in (*TARGETS, "sample", "true_pose", "as_sensor", "status") if n in labels]
-    here = places.iloc[np.minimum(place, len(places) - 1)].reset_index(drop=True)
-    frame = here.assign(true_pose="", as_sensor="", group=group, distance=distance)
-    for name in kept:
-        frame[name] = labels[name].to_numpy()
-    return frame.assign(reason=reason, detail=detail.to_numpy())
-
-
-def _nearest(places: Float64, at: Float64) -> tuple[Float64, Float64, Int64]:
-    """Distance to the nearest place and to the second nearest [m], and which it is."""
-    finite = np.isfinite(at).all(axis=1)
-    first = np.full(len(at), np.inf)
-    second, place = first.copy(), np.zeros(len(at), np.int64)
-    usable = np.flatnonzero(np.isfinite(places).all(axis=1))
-    if usable.size and finite.any():
-        origin = places[usable[0]]
-        tree = cKDTree(places[usable] - origin)
-        found = tree.query(at[finite] - origin, k=2)
-        distance, index = np.asarray(found[0]), np.asarray(found[1])
-        first[finite], second[finite] = distance[:, 0], distance[:, 1]
-        place[finite] = usable[np.minimum(index[:, 0], usable.size - 1)]
-    return first, second, place
-
-
-def _nearest_scan_only(reason: NDArray[np.object_], place: Int64, distance: Float64) -> None:
-    """Of the scans of one sample point, the nearest keeps it; equally near ones lose it."""
-    claims = pd.DataFrame({"place": place, "distance": distance})[reason == ""]
-    least = claims.groupby("place")["distance"].transform("min")
-    nearest = claims["distance"] - least <= SAME
-    ties = nearest.groupby(claims["place"]).transform("sum") > 1
-    rows = claims.index.to_numpy()
-    reason[rows[~nearest.to_numpy()]] = "another scan is nearer to the sample point"
-    reason[rows[(nearest & ties).to_numpy()]] = "two scans equally near to the sample point"
-
-
 def _checked(table: pd.DataFrame, names: list[str]) -> pd.DataFrame:
-    """With the reasons that lie in the values: no factors, or a NaN among factors or labels."""
+    """With the reasons that lie in the values: a NaN among factors or labels."""
     reason = table["reason"].to_numpy(object).copy()
-    detail = (
-        table["detail"].to_numpy(object).copy() if "detail" in table else np.full(len(table), "")
-    )
-    no_factors = (reason == "") & (table["factor_status"] != "done").to_numpy()
-    detail[no_factors] = table["factor_reason"].to_numpy()[no_factors]
-    reason[no_factors] = "no factors at the sample point"
     for kind, wanted in (("factor", names), ("label", [n for n in TARGETS if n in table])):
         for name in wanted:
             bad = (reason == "") & ~np.isfinite(table[name].to_numpy(np.float64))
             reason[bad] = f"{kind} {name} is not a number"
-    return table.assign(reason=reason, detail=detail)
+    return table.assign(reason=reason)
 
 
 def _without_lone(table: pd.DataFrame) -> pd.DataFrame:

@@ -106,6 +106,8 @@ def plan_factors(
     out: str | os.PathLike[str],
     looking: Looking,
     memory: int,
+    group: str = "",
+    applies: Stage = factors,
 ) -> Plan:
     """What `factors_along` will run; other arguments and errors as there.
 
@@ -115,10 +117,15 @@ def plan_factors(
         out: folder of the tables.
         looking: what the factors are made with.
         memory: what a task may use [bytes].
+        group: of which drive, where one plan has several.
+        applies: `factors`, or `factors_drive`.
     """
     map_plan.store.grid.require_cell_size(whole_mm(looking.cell_size, "cell_size"))
     folder = os.fspath(out)
-    tasks = [factors_task(map_plan, key, some, looking, folder) for key, some in samples.items()]
+    tasks = [
+        factors_task(map_plan, key, some, looking, folder, group, applies)
+        for key, some in samples.items()
+    ]
     return Plan.of((*map_plan.tasks.values(), *tasks), memory)
 
 
@@ -200,7 +207,7 @@ def plan_observe(
         out: folder of the tables.
         observing: what is observed with.
         memory: what a task may use [bytes].
-        group: as whose sensor, where one plan observes with several.
+        group: of which drive, or as whose sensor, where one plan has several.
         applies: `observe`, or `observe_drive`.
     """
     map_plan.store.grid.require_cell_size(whole_mm(observing.cell_size, "cell_size"))

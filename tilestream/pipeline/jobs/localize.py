@@ -10,9 +10,10 @@ import numpy as np
 import pandas as pd
 
 from tilestream.errors import PartialError, TileNotReadyError, UsageError
+from tilestream.factors.rows import Samples, samples_of_drive
 from tilestream.formats.logs import ScanLog, ScanSelection
 from tilestream.formats.motion import along
-from tilestream.grid import Box, TileKey, whole_mm
+from tilestream.grid import Box, TileGrid, TileKey, whole_mm
 from tilestream.label import start_poses
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.engine.outputs import Parquet
@@ -186,15 +187,30 @@ def choose_samples(log: ScanLog, scans: ScanSelection, spacing: float) -> tuple[
     )
 
 
-def labelled_places(reading: Reading, scans: ScanSelection, spacing: float) -> Float64:
-    """(k, 2) where a log says that the scans were taken that are localized [m, map frame].
+def labelled_places(
+    grid: TileGrid, reading: Reading, scans: ScanSelection, spacing: float, group: str
+) -> dict[TileKey, Samples]:
+    """Where a log says that the scans were taken that are localized, by the tile that holds them.
+
+    Args:
+        grid: the tiles of the map.
+        reading: the log.
+        scans: which of its scans are used.
+        spacing: distance between sample points [m].
+        group: name of the drive.
 
     Raises:
         UsageError, SourceError: as `localize`.
     """
     log = opened(_absolute(reading))
-    samples = choose_samples(log, scans, spacing)
-    return log.T_map_lidar[[sample.scan for sample in samples], :2, 3]
+    chosen = choose_samples(log, scans, spacing)
+    return samples_of_drive(
+        grid,
+        group,
+        np.array([sample.number for sample in chosen]),
+        np.array([sample.arc_length for sample in chosen]),
+        log.T_map_lidar[[sample.scan for sample in chosen]],
+    )
 
 
 def tiles_in_reach(map_plan: MapPlan, places: Float64, reach: float) -> list[TileKey]:

@@ -41,9 +41,9 @@ from tilestream.pipeline.jobs.run_findings import Done, findings_of, heights_tol
 from tilestream.pipeline.jobs.run_inputs import (
     Inputs,
     check_model,
-    degraded_drives,
     inputs_of,
     read_map,
+    seen_otherwise,
 )
 from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
 from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
@@ -228,7 +228,12 @@ class _Story:
 def _remove_other_groups(settings: RunSettings, measure: Plan) -> None:
     """Remove the tables of drives of other settings, so that two jobs are never mixed."""
     own = {path.rsplit("/", 1)[0] for path in paths_of(measure.tasks)}
-    for kind, below in (("errors", ""), ("starts", ""), ("drives", "/observability")):
+    for kind, below in (
+        ("errors", ""),
+        ("starts", ""),
+        ("drives", "/factors"),
+        ("drives", "/observability"),
+    ):
         for group in Files.at(f"{settings.out}/tables/{kind}").names():
             folder = f"{settings.out}/tables/{kind}/{group}{below}"
             if folder not in own:
@@ -267,12 +272,12 @@ def _report(settings: RunSettings, inputs: Inputs, story: _Story, book: Book) ->
     if known is not None:
         book.facts |= {"labelled": len(known), "lost_labels": known.losses}
     found, evaluation = findings_of(
-        settings.report.title or settings.folder.name,
         done,
         story.store,
         known,
         _facts(settings, inputs, book, known),
-        model=settings.model,
+        settings,
+        seen_otherwise(settings, inputs.drives),
     )
     text = json.dumps(plain(evaluation), indent=1, allow_nan=False)
     write_text(settings.folder / "tables" / "evaluation.json", text + "\n")
@@ -310,8 +315,7 @@ def _facts(
 
 def _on_degraded(settings: RunSettings, inputs: Inputs) -> list[str]:
     """What a reader must know of drives that were read as another lidar than the vehicle's."""
-    others = degraded_drives(settings, inputs.drives)
-    groups = [drive.group for drive in inputs.drives if drive.degraded in others]
+    groups = seen_otherwise(settings, inputs.drives)
     if not groups:
         return []
     told = f"observed as the lidar that they are read as: {', '.join(groups)}"

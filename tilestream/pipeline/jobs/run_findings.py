@@ -11,14 +11,14 @@ from tilestream.errors import ModelError
 from tilestream.factors.heights import note_of_drive, notes_of_routes
 from tilestream.factors.virtual_drive import physics
 from tilestream.grid import MM_PER_M, Box
-from tilestream.model.dataset import TARGETS, Dataset
+from tilestream.model.dataset import TARGETS, Dataset, nearest_along
 from tilestream.model.evaluation import ceiling, factor_sets, figures_by_protocol
 from tilestream.model.intervals import coverage
 from tilestream.model.registry import REGRESSORS
 from tilestream.model.training import MAIN, PREDICTION_COLUMNS
 from tilestream.pipeline.engine.plan import paths_of
 from tilestream.pipeline.engine.stage import Task
-from tilestream.pipeline.jobs.run_settings import ModelSettings, RunSettings
+from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.stages.evaluate import by_protocol
 from tilestream.pipeline.stages.samples import places_with_factors
 from tilestream.records import Float64
@@ -48,10 +48,6 @@ class Done:
         """The joined dataset; None: nothing was measured, or it could not be joined."""
         joined = self.outputs("samples")
         return joined[0].writes.read() if joined else None
-
-    def seen_otherwise(self) -> list[str]:
-        """The groups of labels that were seen with another lidar than the vehicle's."""
-        return [group for task in self.outputs("samples") for group in task.takes.get("own_of", {})]
 
     def evaluations(self) -> dict[tuple[str, str, str], dict[str, pd.DataFrame | str]]:
         """What was evaluated, by (target, competitor, factor set; empty: all factors)."""
@@ -100,6 +96,7 @@ def labels_of(
     dataset: Dataset | None,
     places: pd.DataFrame,
     points: pd.DataFrame | None,
+    reach: float,
     own: Collection[str] = (),
     offset: float | None = None,
 ) -> pd.DataFrame:
@@ -110,6 +107,7 @@ def labels_of(
         places: every sample point.
         points: held-out points of the model that leaves paths out; None: the model in use was
             trained elsewhere, so that its estimates are held out as they are.
+        reach: how far along the path of a label that may have been said [m].
         own: groups of labels that were seen with another lidar than the vehicle's, for which the
             estimates of `places` are. Without `points` they have that of their own virtual drive,
             and none by a model, which was trained for the vehicle's.
@@ -122,8 +120,7 @@ def labels_of(
     else:
         said = points.rename(columns={"estimate": "held_out"})
     kept = ["held_out"] if points is not None else ["held_out", "low", "high"]
-    said = said[["path", "arc_length", *kept]]
-    found = dataset.rows.merge(said, on=["path", "arc_length"], how="left", validate="many_to_one")
+    found = nearest_along(dataset.rows, said[["path", "arc_length", *kept]], reach)
     if points is None and own:
         others = found["group"].isin(list(own))
         found.loc[others, kept] = np.nan
@@ -182,20 +179,21 @@ def ceilings(dataset: Dataset | None, targets: Sequence[str]) -> dict[str, dict[
 
 
 def findings_of(
-    title: str,
     done: Done,
     store: TileStore,
     dataset: Dataset | None,
     facts: Mapping[str, Any],
-    *,
-    model: ModelSettings,
+    settings: RunSettings,
+    otherwise: Collection[str],
 ) -> tuple[Findings, dict[str, Any]]:
     """All that the report tells, and the figures of the evaluation for machines.
 
+    `otherwise` are the groups of labels that were seen with another lidar than the vehicle's.
     Held-out estimates are those of the model's own recipe, and there are none where no path could
     be left out; of a model that was not trained on these labels all estimates are held out as they
     are.
     """
+    model = settings.model
     places, found = places_of(done), done.evaluations()
     sets = [] if dataset is None else list(factor_sets(dataset.columns))
     tables = evaluation_of(found, sets, model.recipe)
@@ -206,13 +204,14 @@ def findings_of(
     ceiling_of = ceilings(dataset, TARGETS)
     trained_here = model.use is None and not model.untrained
     gathered = Findings(
-        title=title,
+        title=settings.report.title or settings.folder.name,
         places=places,
         labels=labels_of(
             dataset,
             places,
             points if trained_here else None,
-            done.seen_otherwise(),
+            settings.spacing,
+            otherwise,
             model.offset if model.untrained else None,
         ),
         protocols=tables["protocols"],

@@ -288,6 +288,12 @@ def degraded_drives(settings: RunSettings, drives: Sequence[DriveSettings]) -> d
     return {name: observing for name, observing in found.items() if observing != vehicle}
 
 
+def seen_otherwise(settings: RunSettings, drives: Sequence[DriveSettings]) -> list[str]:
+    """The groups of the drives that are observed with another lidar than the vehicle's."""
+    others = degraded_drives(settings, drives)
+    return [drive.group for drive in drives if drive.degraded in others]
+
+
 def making_of(settings: RunSettings) -> dict[str, Any]:
     """What the factors are made with, as a model remembers it."""
     making = made_with(COLUMNS, settings.looking_sensor, settings.cell_size)

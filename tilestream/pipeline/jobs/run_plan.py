@@ -1,12 +1,10 @@
 """What the main job runs: tiles, factors and errors; then what is learnt of them."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from tilestream.factors import catalogue
-from tilestream.factors.rows import Samples
 from tilestream.factors.virtual_drive import NEIGHBOURS
 from tilestream.grid import MM_PER_M, TileGrid, TileKey
 from tilestream.model.baselines import Median
@@ -14,7 +12,6 @@ from tilestream.model.dataset import TARGETS
 from tilestream.model.evaluation import factor_sets
 from tilestream.model.features import features_of
 from tilestream.model.forest import PaperForest
-from tilestream.model.join import TOLERANCE
 from tilestream.model.registry import COMPETITORS, REGRESSORS, UNTRAINED
 from tilestream.model.training import MAIN
 from tilestream.pipeline.engine.attempt import Outcome
@@ -25,30 +22,30 @@ from tilestream.pipeline.jobs.along_routes import plan_factors, plan_observe, sa
 from tilestream.pipeline.jobs.localize import labelled_places, plan_localize
 from tilestream.pipeline.jobs.run_inputs import (
     Inputs,
-    degraded_drives,
     making_of,
+    observing_drive,
     observing_of,
     reading_of,
     scans_of,
 )
 from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.stages.evaluate import evaluate
-from tilestream.pipeline.stages.factors import Looking
+from tilestream.pipeline.stages.factors import Looking, factors_drive
 from tilestream.pipeline.stages.importance import importance
+from tilestream.pipeline.stages.label import label
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.observe import observe_drive
 from tilestream.pipeline.stages.predict import predict
 from tilestream.pipeline.stages.samples import COLUMNS, DatasetFile, samples
 from tilestream.pipeline.stages.train import ModelFile, ModelInUse, train
 
+OF_DRIVES = (factors_drive.name, observe_drive.name)
+"""The stages that look from the places of scans."""
 OPPONENT = Median.name
 """What the estimates of a part of the error are compared with: the others know no more of unseen
 paths."""
 NEIGHBOURS_MM = round(NEIGHBOURS * MM_PER_M) + 1
 """How far from a tile a sample point of it may have neighbours, rounding included [mm]."""
-BESIDE = TOLERANCE + NEIGHBOURS + 1.0
-"""How far from a labelled place sample points may matter [m]: the one that it takes its factors
-from, that one's neighbours, and what a refined true pose moves."""
 
 
 def plan_measure(settings: RunSettings, inputs: Inputs, map_plan: MapPlan) -> Plan:
@@ -60,20 +57,13 @@ def plan_measure(settings: RunSettings, inputs: Inputs, map_plan: MapPlan) -> Pl
         map_plan: the map, as far as it is there or will be.
     """
     tables = f"{settings.out}/tables"
-    looking = Looking(
-        settings.looking_sensor,
-        settings.cell_size,
-        "all",
-        settings.sensor_height,
-        settings.route_z,
-    )
     places = samples_along(map_plan.store, inputs.routes, settings.spacing)
     memory = settings.memory
-    plans = [plan_factors(map_plan, places, tables, looking, memory)]
+    plans = [plan_factors(map_plan, places, tables, looking_of(settings), memory)]
     if settings.observe is not None:
         observing = observing_of(settings, settings.observe)
         plans.append(plan_observe(map_plan, places, tables, observing, memory))
-        plans += _observed_drives(settings, inputs, map_plan, places)
+    plans += _plans_of_drives(settings, inputs, map_plan)
     plans += [
         plan_localize(
             map_plan,
@@ -94,33 +84,33 @@ def plan_measure(settings: RunSettings, inputs: Inputs, map_plan: MapPlan) -> Pl
     return Plan.of((task for plan in plans for task in plan.tasks), memory)
 
 
-def _observed_drives(
-    settings: RunSettings,
-    inputs: Inputs,
-    map_plan: MapPlan,
-    places: Mapping[TileKey, Samples],
-) -> Iterator[Plan]:
-    """The labelled places of drives that are read as another lidar than the vehicle's, as seen by
-    that one.
+def _plans_of_drives(settings: RunSettings, inputs: Inputs, map_plan: MapPlan) -> Iterator[Plan]:
+    """The factors and the virtual drives at the places of the scans that are labelled; as the lidar
+    that the drive is read as.
     """
-    for name, observing in degraded_drives(settings, inputs.drives).items():
-        labelled = np.concatenate(
-            [
-                labelled_places(reading_of(drive), scans_of(drive), settings.spacing)
-                for drive in inputs.drives
-                if drive.degraded == name
-            ]
-        )
-        near = {key: samples.near(labelled, BESIDE) for key, samples in places.items()}
-        yield plan_observe(
-            map_plan,
-            {key: samples for key, samples in near.items() if len(samples)},
-            f"{settings.out}/tables/drives/{name}",
-            observing,
-            settings.memory,
-            name,
-            observe_drive,
-        )
+    for drive in inputs.drives:
+        grid, reading, scans = map_plan.store.grid, reading_of(drive), scans_of(drive)
+        places = labelled_places(grid, reading, scans, settings.spacing, drive.group)
+        folder, memory = f"{settings.out}/tables/drives/{drive.group}", settings.memory
+        looking = replace(looking_of(settings), route_z="lidar")
+        yield plan_factors(map_plan, places, folder, looking, memory, drive.group, factors_drive)
+        if settings.observe is not None:
+            observing = observing_drive(settings, settings.observe, drive)
+            observing = replace(observing, route_z="lidar")
+            yield plan_observe(
+                map_plan, places, folder, observing, memory, drive.group, observe_drive
+            )
+
+
+def looking_of(settings: RunSettings) -> Looking:
+    """What the factors are made with."""
+    return Looking(
+        settings.looking_sensor,
+        settings.cell_size,
+        "all",
+        settings.sensor_height,
+        settings.route_z,
+    )
 
 
 def plan_estimate(
@@ -140,12 +130,11 @@ def plan_estimate(
     if settings.observe is not None:
         seen = {task.tile for task in observed}
         factors = [task for task in factors if task.tile in seen]
-    own = _observed_of_drives(settings, measure, done)
-    labels = [task for task in labels if own.get(_group(task), True)]
     tasks: list[Task] = []
     known, model = _model_there(settings)
     if labels and factors:
-        joined = _samples(settings, factors, observed, labels, own)
+        of_drives = [task for task in measure.tasks if task.stage in OF_DRIVES and task.key in done]
+        joined = _samples(settings, factors, of_drives, labels)
         tasks.append(joined)
         if not known:
             training = _training(settings, joined)
@@ -155,25 +144,6 @@ def plan_estimate(
     if known:
         tasks += _predictions(settings, grid, factors, observed, model)
     return Plan.of(tasks, settings.memory)
-
-
-def _observed_of_drives(
-    settings: RunSettings, measure: Plan, done: Set[str]
-) -> dict[str, tuple[Task, ...]]:
-    """What is done of the virtual drives of each drive that is read as another lidar than the
-    vehicle's, by the group of its labels.
-    """
-    found = {}
-    for drive in settings.drives:
-        folder = f"{settings.out}/tables/drives/{drive.degraded}/"
-        tasks = [
-            task
-            for task in measure.outputs(observe_drive.name)
-            if isinstance(task.writes, Parquet) and task.writes.path.startswith(folder)
-        ]
-        if tasks:
-            found[drive.group] = tuple(task for task in tasks if task.key in done)
-    return found
 
 
 def _model_there(settings: RunSettings) -> tuple[bool, Readable | None]:
@@ -187,41 +157,43 @@ def _model_there(settings: RunSettings) -> tuple[bool, Readable | None]:
 
 def _samples(
     settings: RunSettings,
-    factors: Sequence[Task],
-    observed: Sequence[Task],
+    routes: Sequence[Task],
+    of_drives: Sequence[Task],
     labels: Sequence[Task],
-    own: Mapping[str, Sequence[Task]],
 ) -> Task:
-    takes: dict[str, Any] = {
-        "groups": tuple(_group(task) for task in labels),
-        "making": making_of(settings),
+    """The task that joins labels with the factors of their places.
+
+    Args:
+        settings: the job.
+        routes: the factors along the routes.
+        of_drives: the factors and virtual drives at the places of scans.
+        labels: the errors.
+    """
+    parts = {
+        "factors": [task for task in of_drives if task.stage == factors_drive.name],
+        "observed": [task for task in of_drives if task.stage == observe_drive.name],
+        "labels": labels,
     }
-    reads = {
-        "factors": _products(factors),
-        "observed": _products(observed),
-        "labels": _products(labels),
-    }
-    tables = list(dict.fromkeys(task for tasks in own.values() for task in tasks))
-    if tables:
-        reads["own"] = _products(tables)
-        takes["own_of"] = {
-            group: [tables.index(task) for task in tasks] for group, tasks in own.items() if tasks
-        }
     return Task(
         samples,
         "dataset",
         DatasetFile(f"{settings.out}/tables/samples/dataset.parquet"),
-        takes=takes,
-        reads=reads,
+        takes={
+            "groups": {name: tuple(map(_group, tasks)) for name, tasks in parts.items()},
+            "making": making_of(settings),
+        },
+        reads={"routes": _products(routes)}
+        | {name: _products(tasks) for name, tasks in parts.items()},
         work=sum(task.work for task in labels),
-        counts={"places": sum(task.work for task in (*factors, *labels))},
+        counts={"places": sum(task.work for task in (*routes, *of_drives, *labels))},
     )
 
 
-def _group(label: Task) -> str:
-    """Of which drive, as whose sensor, a label task is: the folder of its table."""
-    assert isinstance(label.writes, Parquet)
-    return label.writes.path.rsplit("/", 2)[1]
+def _group(task: Task) -> str:
+    """Of which drive, as whose sensor, a task is: `errors/<group>/…`, `drives/<group>/…/…`."""
+    assert isinstance(task.writes, Parquet)
+    parts = task.writes.path.split("/")
+    return parts[-2] if task.stage == label.name else parts[-3]
 
 
 def _products(tasks: Iterable[Task]) -> tuple[Readable, ...]:

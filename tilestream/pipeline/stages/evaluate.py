@@ -32,7 +32,7 @@ HELD_OUT_COLUMNS = (
 
 @stage(
     "evaluate",
-    version=4,
+    version=5,
     memory=lambda counts: FOREST_BYTES + BYTES_PER_ROW * counts["places"],
     seconds=45.0,
     columns=HELD_OUT_COLUMNS,
@@ -41,13 +41,13 @@ def evaluate(dataset: Dataset, competitor: str, target: str, factor_set: str, se
     """The held-out points of every protocol with their estimates, or why there are none.
 
     Args:
-        dataset: every place is taken once.
+        dataset: every path is taken once.
         competitor: which model or opponent.
         target: what is estimated.
         factor_set: name of the factors it may use (`evaluation.factor_sets`); empty: all.
         seed: of what is random.
     """
-    dataset = dataset.first_drives()
+    dataset = dataset.each_path_once()
     if factor_set:
         dataset = dataset.with_columns(factor_sets(dataset.columns)[factor_set])
     try:

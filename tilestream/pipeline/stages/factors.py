@@ -10,7 +10,7 @@ from tilestream.factors.table import factors as factors_of
 from tilestream.grid import Box, TileKey, whole_mm
 from tilestream.marks import canonical
 from tilestream.pipeline.engine.outputs import Made, Parquet
-from tilestream.pipeline.engine.stage import Task, stage
+from tilestream.pipeline.engine.stage import Stage, Task, stage
 from tilestream.pipeline.stages.map_part import MapPart
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.records import RouteZ
@@ -60,6 +60,19 @@ def factors(map_part: MapPart, samples: Samples, looking: Looking) -> Made:
     return Made(rows, facts)
 
 
+@stage(
+    "factors_drive",
+    version=factors.version,
+    memory=factors.memory,
+    seconds=factors.seconds,
+    columns=factors.columns,
+)
+def factors_drive(map_part: MapPart, samples: Samples, looking: Looking) -> Made:
+    """The same at the places of the scans of a drive: what its labels are joined with."""
+    made: Made = factors.function(map_part, samples, looking)
+    return made
+
+
 @lru_cache(maxsize=1)
 def _cache(url: str, cell_size: float, state: str) -> TermsCache:  # noqa: ARG001 - part of the key
     """The terms that this process holds for the tasks that follow."""
@@ -67,14 +80,30 @@ def _cache(url: str, cell_size: float, state: str) -> TermsCache:  # noqa: ARG00
 
 
 def factors_task(
-    plan: MapPlan, tile: TileKey, samples: Samples, looking: Looking, folder: str
+    plan: MapPlan,
+    tile: TileKey,
+    samples: Samples,
+    looking: Looking,
+    folder: str,
+    group: str = "",
+    applies: Stage = factors,
 ) -> Task:
-    """The factors of the sample points of a tile, from the terms of the tiles in sight."""
+    """The factors of the sample points of a tile, from the terms of the tiles in sight.
+
+    Args:
+        plan: the map.
+        tile: the tile that holds the sample points.
+        samples: the sample points.
+        looking: what the factors are made with.
+        folder: of the tables.
+        group: of which drive, where one plan has several.
+        applies: `factors`, or `factors_drive`.
+    """
     cell_mm = whole_mm(looking.cell_size, "cell_size")
     seen = plan.over(Box.around(samples.places, looking.sensor.range_max))
     return Task(
-        factors,
-        str(tile),
+        applies,
+        "-".join(part for part in (group, str(tile)) if part),
         Parquet(f"{folder}/factors/{tile}.parquet"),
         takes={"samples": samples, "looking": looking},
         reads={"map_part": plan.part(seen, [plan.terms(key, cell_mm) for key in seen])},

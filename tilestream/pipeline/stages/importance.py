@@ -34,7 +34,7 @@ def importance(dataset: Dataset, model: Model, seed: int) -> Made:
     """A row per factor and model with its importance, and one per criterion permuted.
 
     Args:
-        dataset: what was measured; every place is taken once.
+        dataset: what was measured; every path is taken once.
         model: the one in use, trained on it.
         seed: of permutations and of what is fitted without held-out blocks.
 
@@ -42,7 +42,7 @@ def importance(dataset: Dataset, model: Model, seed: int) -> Made:
         ModelError: nothing can be learnt from this dataset. Without two blocks there are no rows
             of criteria; a fact of the table says why.
     """
-    dataset = dataset.first_drives()
+    dataset = dataset.each_path_once()
     dataset.check()
     used = dataset.with_columns([c for c in dataset.columns if c.name in model.factors])
     papers = dataset.with_columns([c for c in dataset.columns if c.factor_set == "faithful"])

@@ -82,7 +82,7 @@ def observe(map_part: MapPart, samples: Samples, observing: Observing) -> Made:
     columns=observe.columns,
 )
 def observe_drive(map_part: MapPart, samples: Samples, observing: Observing) -> Made:
-    """The same as the lidar sees that a drive is read as: what its labels are joined with."""
+    """The same at the places of the scans of a drive, as the lidar sees that it is read as."""
     made: Made = observe.function(map_part, samples, observing)
     return made
 
@@ -104,7 +104,7 @@ def observe_task(
         samples: the sample points.
         observing: what is observed with.
         folder: of the tables.
-        group: as whose sensor, where one plan observes with several.
+        group: of which drive, or as whose sensor, where one plan has several.
         applies: `observe`, or `observe_drive`.
     """
     cell_mm = whole_mm(observing.cell_size, "cell_size")

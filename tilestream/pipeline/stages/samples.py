@@ -37,9 +37,9 @@ COLUMNS = (
 """All factors that a model may learn from."""
 DATASET_COLUMNS = (
     Column("group", "place", "", "Which drive, as whose sensor.", "", dtype="str"),
-    Column("path", "place", "", "The route that the place lies on.", "", dtype="str"),
+    Column("path", "place", "", "The route that the place lies on, or the drive.", "", dtype="str"),
     Column("block", "place", "", "Piece of the path that is held out as one.", "", dtype="str"),
-    Column("distance", "place", "m", "Between the scan and the sample point.", ""),
+    Column("distance", "place", "m", "Of the scan from its path, horizontally.", ""),
 )
 LOST_COLUMNS = (
     *DATASET_COLUMNS,
@@ -110,49 +110,54 @@ def _dataset(file: DatasetFile, identity: str) -> Dataset:  # noqa: ARG001 - ano
 
 @stage(
     "samples",
-    version=4,
+    version=5,
     memory=lambda counts: FOREST_BYTES + BYTES_PER_ROW * counts["places"],
     seconds=0.001,
 )
 def samples(
+    routes: Sequence[Stored],
     factors: Sequence[Stored],
     observed: Sequence[Stored],
     labels: Sequence[Stored],
-    groups: Sequence[str],
+    groups: Mapping[str, Sequence[str]],
     making: dict[str, Any],
-    own: Sequence[Stored] = (),
-    own_of: Mapping[str, Sequence[int]] | None = None,
 ) -> Dataset:
-    """The factors and the errors of the same places as one dataset.
+    """The labels with the factors and virtual drives of their own places, as one dataset.
 
     Args:
-        factors: tables of factors.
-        observed: tables of observability; none: the job has no virtual drive.
+        routes: tables of factors along the routes: what the paths are.
+        factors: tables of factors at the places of scans.
+        observed: tables of observability there; none: the job has no virtual drive.
         labels: tables of errors.
-        groups: of each table of errors, which drive it is of, as whose sensor.
+        groups: of each of these tables, which drive it is of, as whose sensor.
         making: what the factors were computed with.
-        own: tables of observability as the lidars see that drives are read as.
-        own_of: which of these belong to a group; a group that is not there is of the vehicle's
-            lidar.
     """
-    of_group: dict[str, list[Stored]] = {}
-    for group, table in zip(groups, labels, strict=True):
-        of_group.setdefault(group, []).append(table)
-    rows = {name: _rows(tables) for name, tables in of_group.items()}
-    data_sets = {name: tables[0].facts["data_set"] for name, tables in of_group.items()}
-    places = places_with_factors(factors, observed)
-    seen_otherwise = {
-        group: places_with_factors(factors, [own[number] for number in numbers])
-        for group, numbers in (own_of or {}).items()
+    of_group = {
+        name: _by_group(tables, groups[name])
+        for name, tables in (("factors", factors), ("observed", observed), ("labels", labels))
     }
+    places = {
+        name: places_with_factors(tables, of_group["observed"].get(name, ()))
+        for name, tables in of_group["factors"].items()
+        if name in of_group["observed"] or not observed
+    }
+    measured = of_group["labels"]
     return join(
+        _rows(routes),
         places,
-        rows,
+        {name: _rows(tables) for name, tables in measured.items()},
         COLUMNS,
-        own_factors=seen_otherwise,
         made_with=making,
-        data_sets=data_sets,
+        data_sets={name: tables[0].facts["data_set"] for name, tables in measured.items()},
     )
+
+
+def _by_group(tables: Sequence[Stored], groups: Sequence[str]) -> dict[str, list[Stored]]:
+    """Tables by the name that each has."""
+    found: dict[str, list[Stored]] = {}
+    for name, table in zip(groups, tables, strict=True):
+        found.setdefault(name, []).append(table)
+    return found
 
 
 def places_with_factors(factors: Sequence[Stored], observed: Sequence[Stored]) -> pd.DataFrame:
