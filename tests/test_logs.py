@@ -28,6 +28,7 @@ from tilestream.formats.drive import open_drive
 from tilestream.formats.logs import LOG_FORMATS, ScanSelection, is_log, open_log, write_log
 from tilestream.formats.logs.poses import PoseStatus, transform
 from tilestream.records import Scan, Trajectory
+from tilestream.settings import LogOptions
 
 Write = Callable[[Path, list[Scan], Trajectory], Path]
 """Writes scans and poses as a log in a folder, and says where."""
@@ -186,7 +187,7 @@ def test_scans_between_poses_are_posed_and_others_skipped(name: str, tmp_path: P
     np.testing.assert_allclose(found[1.5], pose(x=3.0), atol=1e-12)
     assert np.isnan(log.T_map_lidar[5]).all()
     assert open_drive(path).info().points == 4 * 200
-    assert open_log(path, max_gap_s=3.0).posed.sum() == 9
+    assert open_log(path, LogOptions(max_gap_s=3.0)).posed.sum() == 9
 
 
 @pytest.mark.parametrize("name", CASES)

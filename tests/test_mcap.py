@@ -18,6 +18,7 @@ from tilestream.formats.logs.drivers import time_offsets
 from tilestream.formats.logs.mcap_file import McapFile
 from tilestream.formats.logs.poses import PoseStatus
 from tilestream.records import Scan
+from tilestream.settings import LogOptions
 
 MAKES: dict[str, dict[str, Any]] = {
     "zstd": {"chunk_size": 4096, "compression": CompressionType.ZSTD},
@@ -375,7 +376,7 @@ def test_a_pose_without_a_frame_is_taken_as_the_lidars_and_it_says_so(tmp_path: 
     log = open_log(path)
     np.testing.assert_allclose(log.T_map_lidar[0], pose(x=5.0), atol=1e-12)
     assert any("taken as those of the lidar" in note for note in log.notes)
-    named = open_log(path, pose_frame="base")
+    named = open_log(path, LogOptions(pose_frame="base"))
     np.testing.assert_allclose(named.T_map_lidar[0], pose(x=5.0, z=2.0), atol=1e-12)
 
 
@@ -391,7 +392,7 @@ def test_poses_in_the_map_go_before_others_however_many(tmp_path: Path) -> None:
     log = open_log(path)
     assert log.pose_topic == "/localization"
     assert any("/wheels" in note for note in log.notes)
-    assert open_log(path, pose_topic="/wheels").pose_topic == "/wheels"
+    assert open_log(path, LogOptions(pose_topic="/wheels")).pose_topic == "/wheels"
 
 
 def test_the_topic_with_the_most_clouds_is_taken_and_noted(tmp_path: Path) -> None:
@@ -407,7 +408,7 @@ def test_the_topic_with_the_most_clouds_is_taken_and_noted(tmp_path: Path) -> No
     tie = logs.write(tmp_path / "tie.mcap", [*messages, messages[1]])
     with pytest.raises(SourceError, match=r"/map_cloud, /points; name one as points_topic"):
         open_log(tie)
-    assert len(open_log(tie, points_topic="/map_cloud")) == 2
+    assert len(open_log(tie, LogOptions(points_topic="/map_cloud"))) == 2
 
 
 def test_scans_come_in_order_of_their_stamps(tmp_path: Path) -> None:

@@ -13,12 +13,13 @@ import numpy as np
 
 from tilestream.errors import CorruptSourceError, PoseError, SourceError
 from tilestream.formats.logs import ros2
-from tilestream.formats.logs.base import LogOptions, RecordedScan, Recording
+from tilestream.formats.logs.base import RecordedScan, Recording
 from tilestream.formats.logs.drivers import recorded_scan
 from tilestream.formats.logs.mcap_file import MAGIC, McapFile, Message
 from tilestream.formats.logs.ros2_poses import POSE_TYPES, PoseTrack, choose_poses
 from tilestream.formats.registry import Format
 from tilestream.records import Int64
+from tilestream.settings import LogOptions
 
 
 @dataclass(frozen=True, eq=False)

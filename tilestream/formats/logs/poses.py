@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from tilestream.formats.motion import jumped
+from tilestream.formats.motion import FASTEST, jumped
 from tilestream.kernels.fixed_order import norms, turned
 from tilestream.records import Float64, Int64, Trajectory
 
@@ -71,7 +71,7 @@ def trajectory(stamps_ns: Int64, numbers: Float64, frame: str) -> tuple[Trajecto
 
 
 def interpolate(
-    poses: Trajectory, stamps_ns: Int64, max_gap_s: float
+    poses: Trajectory, stamps_ns: Int64, max_gap_s: float, max_speed_mps: float = FASTEST
 ) -> tuple[Float64, NDArray[np.int8]]:
     """The pose at some times: position linear, rotation at constant rate between two poses (slerp),
     the recorded pose itself where the times agree, never beyond the first or last pose, and never
@@ -81,6 +81,7 @@ def interpolate(
         poses: k >= 0 poses.
         stamps_ns: (m,) times [ns].
         max_gap_s: longest time between two poses to interpolate over [s].
+        max_speed_mps: fastest that the vehicle drives [m/s].
 
     Returns:
         (m, 4, 4) poses, NaN where there is none; (m,) `PoseStatus`.
@@ -103,15 +104,15 @@ def interpolate(
     gaps = np.flatnonzero(between)[span > max_gap_s * 1e9]
     T[gaps], status[gaps] = np.nan, PoseStatus.GAP
     steps = norms(poses.T_map_lidar[b, :3, 3] - poses.T_map_lidar[b - 1, :3, 3])
-    over = np.flatnonzero(between)[jumped(steps, span / 1e9)]
+    over = np.flatnonzero(between)[jumped(steps, span / 1e9, max_speed_mps)]
     T[over], status[over] = np.nan, PoseStatus.JUMP
     return T, status
 
 
-def jumps(poses: Trajectory) -> NDArray[np.bool_]:
+def jumps(poses: Trajectory, max_speed_mps: float = FASTEST) -> NDArray[np.bool_]:
     """(k - 1,) whether no vehicle drives from each pose to the next in the time between them."""
     steps = norms(np.diff(poses.T_map_lidar[:, :3, 3], axis=0))
-    return jumped(steps, np.diff(poses.stamps_ns) / 1e9)
+    return jumped(steps, np.diff(poses.stamps_ns) / 1e9, max_speed_mps)
 
 
 def _blend(T_a: Float64, T_b: Float64, share: Float64) -> Float64:

@@ -7,9 +7,9 @@ import numpy as np
 
 from tilestream.errors import PoseError
 from tilestream.formats.logs import ros2
-from tilestream.formats.logs.base import LogOptions
 from tilestream.formats.logs.poses import Edge, compose, trajectory
 from tilestream.records import Float64, Int64, Trajectory
+from tilestream.settings import LogOptions
 
 POSE_TYPES = (ros2.ODOMETRY, ros2.POSE, ros2.POSE_COVARIANCE)
 

@@ -16,7 +16,7 @@ from tilestream.marks import hash_of
 from tilestream.pipeline.engine.plan import megabytes
 from tilestream.pipeline.jobs.strays import Kept
 from tilestream.pipeline.stages.scatter import Fragment, needed_to_open
-from tilestream.settings import IngestSettings
+from tilestream.settings import IngestSettings, LogOptions
 from tilestream.store import open_store
 
 POINTS_PER_TASK = 4_000_000
@@ -45,25 +45,19 @@ class Source:
     """Why it failed; empty where it did not."""
 
 
-def log_options(
-    points_topic: str | None, pose_topic: str | None, scans: ScanSelection | None
-) -> dict[str, Any]:
-    """How the logs among the sources are read, as `formats.open_source` takes it."""
-    wanted = {"points_topic": points_topic, "pose_topic": pose_topic, "scans": scans}
-    return {name: value for name, value in wanted.items() if value is not None}
-
-
 def examine_all(
     sources: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
     settings: IngestSettings,
-    of_logs: dict[str, Any],
+    log_options: LogOptions | None = None,
+    scans: ScanSelection | None = None,
 ) -> list[Source]:
     """Every file that the sources name, opened as far as its header.
 
     Args:
         sources: files, globs and map directories.
         settings: of the map.
-        of_logs: how logs are read (`log_options`).
+        log_options: topics and frames of the logs among them; None: found.
+        scans: which scans of the logs; None: all.
 
     Raises:
         UsageError: there are no sources.
@@ -71,6 +65,8 @@ def examine_all(
     """
     if isinstance(sources, str | os.PathLike):
         sources = [sources]
+    of_logs = {} if log_options is None else log_options.given
+    of_logs |= {} if scans is None else {"scans": scans}
     found: dict[str, Source] = {}
     for pattern in [os.fspath(source) for source in sources]:
         try:
@@ -155,4 +151,4 @@ def crs_of_map(sources: Iterable[str], url: str, asked: str | None) -> str | Non
     except StoreNotFoundError:
         named = [source for source in sources if not is_log(source)]
         settings = IngestSettings(crs=asked)
-        return with_crs(settings, examine_all(named, settings, {})).crs if named else asked
+        return with_crs(settings, examine_all(named, settings)).crs if named else asked
