@@ -117,7 +117,7 @@ def test_every_second_scan_maps_and_the_others_localize(drive: Path) -> None:
 
 def test_a_slice_reads_only_its_chunks(drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     log = open_log(drive)
-    chunks = set(log.reader.places[10:15, 0].tolist())
+    chunks = set(log.reader.places[10:15, 1].tolist())
     read: list[int] = []
     unpack = McapFile.unpack
 
@@ -308,76 +308,23 @@ def test_no_scan_has_a_pose_over_a_jump(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "make"),
+    ("kind", "make", "frame"),
     [
-        ("nav_msgs/msg/Odometry", logs.odometry),
-        ("geometry_msgs/msg/PoseStamped", logs.pose_stamped),
-        ("geometry_msgs/msg/PoseWithCovarianceStamped", logs.pose_with_covariance),
-        ("tf2_msgs/msg/TFMessage", lambda t, T: logs.transform(t, "map", "lidar", T)),
+        ("nav_msgs/msg/Odometry", logs.odometry, None),
+        ("geometry_msgs/msg/PoseStamped", logs.pose_stamped, "lidar"),
+        ("geometry_msgs/msg/PoseWithCovarianceStamped", logs.pose_with_covariance, "lidar"),
+        ("tf2_msgs/msg/TFMessage", lambda t, T: logs.transform(t, "map", "lidar", T), None),
     ],
 )
-def test_poses_of_every_type(kind: str, make: Any, tmp_path: Path) -> None:
+def test_poses_of_every_type(kind: str, make: Any, frame: str | None, tmp_path: Path) -> None:
     times = [START + i * SECOND // 10 for i in range(5)]
     messages = [(t, "/where", kind, make(t, pose(x=t % 7, yaw=0.3))) for t in times]
     path = logs.write(tmp_path / "a.mcap", [*messages, *(logs.cloud_at(t) for t in times)])
-    log = open_log(path)
+    log = open_log(path, LogOptions(pose_frame=frame))
     assert log.pose_topic == "/where"
     assert log.posed.all()
     for t, T in zip(times, log.T_map_lidar, strict=True):
         np.testing.assert_allclose(T, pose(x=t % 7, yaw=0.3), atol=1e-12)
-
-
-def test_static_transforms_lead_from_the_vehicle_to_the_lidar(tmp_path: Path) -> None:
-    T_base_mast, T_mast_lidar = pose(x=1.0, z=1.5, yaw=0.2), pose(y=0.3, z=0.4, yaw=-0.1)
-    T_map_base = pose(x=100.0, y=50.0, yaw=1.0)
-    T_lidar_mast = np.linalg.inv(T_mast_lidar)  # recorded against the direction of the chain
-    path = logs.write(
-        tmp_path / "a.mcap",
-        [
-            logs.static_tf("base", "mast", T_base_mast),
-            logs.static_tf("lidar", "mast", T_lidar_mast),
-            logs.odometry_at(START, T_map_base, child="base"),
-            logs.cloud_at(START),
-        ],
-    )
-    log = open_log(path)
-    expected = T_map_base @ T_base_mast @ T_mast_lidar
-    np.testing.assert_allclose(log.T_map_lidar[0], expected, atol=1e-12)
-    assert any("base" in note and "static" in note for note in log.notes)
-
-
-def test_tf_composes_moving_and_static_transforms(tmp_path: Path) -> None:
-    messages = [logs.static_tf("base", "lidar", pose(z=2.0, yaw=0.5))]
-    for i in range(0, 11, 2):  # 5 Hz
-        t = START + i * SECOND // 10
-        messages.append(logs.tf_at(t, "map", "odom", pose(x=10.0, y=0.1 * i)))
-    for i in range(1, 9):  # 10 Hz, starts later, ends earlier
-        t = START + i * SECOND // 10
-        messages.append(logs.tf_at(t, "odom", "base", pose(x=float(i))))
-    messages += [logs.cloud_at(START + i * SECOND // 10) for i in range(11)]
-    log = open_log(logs.write(tmp_path / "a.mcap", messages))
-    before, after = PoseStatus.BEFORE, PoseStatus.AFTER
-    assert log.pose_status.tolist() == [before, *[PoseStatus.POSED] * 8, after, after]
-    for i in range(1, 9):
-        expected = pose(x=10.0 + i, y=0.1 * i, z=2.0, yaw=0.5)
-        np.testing.assert_allclose(log.T_map_lidar[i], expected, atol=1e-9)
-
-
-def test_a_pose_without_a_frame_is_taken_as_the_lidars_and_it_says_so(tmp_path: Path) -> None:
-    posed = "geometry_msgs/msg/PoseStamped"
-    path = logs.write(
-        tmp_path / "a.mcap",
-        [
-            logs.static_tf("base", "lidar", pose(z=2.0)),
-            (START, "/pose", posed, logs.pose_stamped(START, pose(x=5.0))),
-            logs.cloud_at(START),
-        ],
-    )
-    log = open_log(path)
-    np.testing.assert_allclose(log.T_map_lidar[0], pose(x=5.0), atol=1e-12)
-    assert any("taken as those of the lidar" in note for note in log.notes)
-    named = open_log(path, LogOptions(pose_frame="base"))
-    np.testing.assert_allclose(named.T_map_lidar[0], pose(x=5.0, z=2.0), atol=1e-12)
 
 
 def test_poses_in_the_map_go_before_others_however_many(tmp_path: Path) -> None:
@@ -392,7 +339,9 @@ def test_poses_in_the_map_go_before_others_however_many(tmp_path: Path) -> None:
     log = open_log(path)
     assert log.pose_topic == "/localization"
     assert any("/wheels" in note for note in log.notes)
-    assert open_log(path, LogOptions(pose_topic="/wheels")).pose_topic == "/wheels"
+    assert (
+        open_log(path, LogOptions(pose_topic="/wheels", map_frame="odom")).pose_topic == "/wheels"
+    )
 
 
 def test_the_topic_with_the_most_clouds_is_taken_and_noted(tmp_path: Path) -> None:

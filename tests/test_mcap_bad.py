@@ -303,16 +303,16 @@ def test_a_message_that_ends_too_early(tmp_path: Path) -> None:
         open_log(path)
 
 
-def test_a_ros_1_log_is_refused(street: Path, tmp_path: Path) -> None:
-    path = tmp_path / "ros1.mcap"
+def test_what_is_not_encoded_as_ros_does_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "other.mcap"
     with path.open("wb") as stream:
         writer = logs.PlainWriter(stream)
-        writer.start("ros1")
-        schema = writer.register_schema("sensor_msgs/PointCloud2", "ros1msg", b"")
-        channel = writer.register_channel("/points", "ros1", schema)
+        writer.start("")
+        schema = writer.register_schema("sensor_msgs/PointCloud2", "protobuf", b"")
+        channel = writer.register_channel("/points", "protobuf", schema)
         writer.add_message(channel, START, b"12345678", START)
         writer.finish()
-    with pytest.raises(SourceError, match=r"'ros1'.*convert"):
+    with pytest.raises(SourceError, match=r"'protobuf'.*convert"):
         open_log(path)
 
 

@@ -11,7 +11,7 @@ import reprlib
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, model_validator
 
 from tilestream.config import Settings
 from tilestream.errors import UsageError
@@ -91,6 +91,15 @@ class LogOptions(Settings):
     max_speed_mps: Positive = 60.0
     """Fastest that the vehicle of a log drives [m/s]: over a faster step no pose is interpolated,
     and a route is cut."""
+
+    @model_validator(mode="after")
+    def _check_lidars(self) -> Self:
+        if "," in (self.points_topic or "") and (self.extrinsic or self.lidar_frame):
+            raise ValueError(
+                f"has several lidars, {self.points_topic}, and extrinsic or lidar_frame, which are "
+                "those of one: leave them out, so that the transforms of the log are taken"
+            )
+        return self
 
     @property
     def given(self) -> dict[str, Any]:

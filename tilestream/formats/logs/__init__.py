@@ -1,6 +1,7 @@
 """Logs of drives, whatever their format: one protocol (base.py) and the registry below."""
 
 from functools import lru_cache
+from glob import glob, has_magic
 from pathlib import Path
 
 from tilestream.formats.logs import mcap
@@ -28,8 +29,11 @@ def is_log(path: str) -> bool:
     """Whether a path, or a glob of paths, is that of a log: by its ending, or a directory's marker;
     the content is not read.
     """
-    named = format_of_ending(path, LOG_FORMATS) or format_of_directory(path, LOG_FORMATS)
-    return named is not None
+    matches = glob(path, recursive=True) if has_magic(path) else ()  # noqa: PTH207
+    return any(
+        format_of_ending(match, LOG_FORMATS) or format_of_directory(match, LOG_FORMATS)
+        for match in (path, *matches)
+    )
 
 
 def open_log(path: str | Path, options: LogOptions | None = None) -> ScanLog:
@@ -39,7 +43,7 @@ def open_log(path: str | Path, options: LogOptions | None = None) -> ScanLog:
 
     Args:
         path: a file or directory of one of `LOG_FORMATS`.
-        options: topics and frames; None: found, see the format, e.g. `mcap.open_mcap`. Several
+        options: topics and frames; None: found, see `recording.record`. Several
             topics of scans, with commas between them, are the lidars of one vehicle, and their
             scans make one each (`together`).
 

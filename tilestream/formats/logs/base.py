@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 
 from tilestream.records import Float64, Int64, Trajectory
 
+METADATA = "metadata.yaml"
+"""What every rosbag2 folder has beside its files."""
+
 
 @dataclass(frozen=True, eq=False)
 class RecordedScan:

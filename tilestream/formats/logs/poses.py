@@ -153,35 +153,3 @@ def path_between(edges: Iterable[Edge], source: str, target: str) -> list[Edge] 
         chain.append(came_from[chain[-1]])
     chain.reverse()
     return list(pairwise(chain))
-
-
-def compose(
-    edges: dict[Edge, Trajectory], source: str, target: str, max_gap_s: float
-) -> Trajectory | None:
-    """The poses of `target` in `source` along a tree of frames.
-
-    An edge with a single pose holds at all times. The result has a pose at every time of every
-    edge that moves, as far as all of them have one there (interpolated, no gap).
-
-    Returns:
-        The trajectory, of frame `target`; without poses where the edges never overlap in time;
-        None where the tree does not connect the frames.
-    """
-    chain = path_between(edges, source, target)
-    if chain is None:
-        return None
-    along = [(edges.get((a, b)), edges.get((b, a))) for a, b in chain]
-    moving = [e for forth, back in along if (e := forth or back) and len(e.stamps_ns) > 1]
-    stamps = np.unique(np.concatenate([e.stamps_ns for e in moving] or [np.zeros(1, np.int64)]))
-    T = np.tile(np.eye(4), (len(stamps), 1, 1))
-    for forth, back in along:
-        T = T @ (_at(forth, stamps, max_gap_s) if forth else inverse(_at(back, stamps, max_gap_s)))
-    posed = np.isfinite(T).all(axis=(1, 2))
-    return Trajectory(stamps[posed], T[posed], target)
-
-
-def _at(edge: Trajectory | None, stamps_ns: Int64, max_gap_s: float) -> Float64:
-    assert edge is not None
-    if len(edge.stamps_ns) == 1:
-        return np.broadcast_to(edge.T_map_lidar, (len(stamps_ns), 4, 4))
-    return interpolate(edge, stamps_ns, max_gap_s)[0]

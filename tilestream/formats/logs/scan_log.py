@@ -15,7 +15,15 @@ from tilestream.errors import (
 )
 from tilestream.formats.base import SourceInfo
 from tilestream.formats.logs.base import RecordedScan, Recording
-from tilestream.formats.logs.drivers import TIME_FIELDS, TURN_S, returned, ticks_of, time_offsets
+from tilestream.formats.logs.drivers import (
+    FULL_TURN_DEG,
+    TIME_FIELDS,
+    TURN_S,
+    returned,
+    span_deg,
+    ticks_of,
+    time_offsets,
+)
 from tilestream.formats.logs.poses import PoseStatus, interpolate, jumps
 from tilestream.formats.motion import along
 from tilestream.records import Float64, Int64, Scan
@@ -24,7 +32,7 @@ from tilestream.settings import LogOptions
 _BYTES_PER_POINT = 80
 """What the columns of a scan that is read take [bytes per point]."""
 LOOKED_AT = 5
-"""So many scans tell the unit of the points' times."""
+"""So many scans tell how much of a turn they span, and the unit of the points' times."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -119,17 +127,26 @@ def with_poses(found: Recording, options: LogOptions) -> ScanLog:
     )
     notes = (*found.notes, *_skipped(found, status, options), *_jumps(found, options))
     known = {**vars(found), "notes": notes}
-    return _with_times(ScanLog(**known, T_map_lidar=T_map_lidar, pose_status=status))
+    return _looked_at(ScanLog(**known, T_map_lidar=T_map_lidar, pose_status=status))
 
 
-def _with_times(log: ScanLog) -> ScanLog:
+def _looked_at(log: ScanLog) -> ScanLog:
+    """With what a few scans tell: how far round they look, and the unit of the points' times."""
+    few = np.unique(np.linspace(0, len(log) - 1, LOOKED_AT).round().astype(int))
+    scans = list(log.recorded_at(few.tolist()))
+    turn = float(np.median([span_deg(scan.points[returned(scan.points)]) for scan in scans]))
+    if turn < FULL_TURN_DEG:
+        log = replace(log, notes=(*log.notes, f"scans span {turn:.0f} degrees, not a full turn"))
+    return _with_times(log, scans)
+
+
+def _with_times(log: ScanLog, scans: list[RecordedScan]) -> ScanLog:
     """With the unit of the points' times: the one in which the middle of the spans of a few scans
     is a turn of a lidar.
     """
     if not any(name in TIME_FIELDS for name, _ in log.fields):
         return log
-    few = np.unique(np.linspace(0, len(log) - 1, LOOKED_AT).round().astype(int))
-    spans = [_span(recorded) for recorded in log.recorded_at(few.tolist())]
+    spans = [_span(recorded) for recorded in scans]
     span = float(np.median([span for span in spans if span > 0] or [0.0]))
     ticks = ticks_of(span)
     if ticks is None and span > 0:
