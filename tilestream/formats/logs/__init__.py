@@ -4,7 +4,7 @@ from functools import lru_cache
 from glob import glob, has_magic
 from pathlib import Path
 
-from tilestream.formats.logs import mcap
+from tilestream.formats.logs import mcap, ros_bags, rosbag2
 from tilestream.formats.logs.base import Recording
 from tilestream.formats.logs.mcap_write import write_log
 from tilestream.formats.logs.scan_log import ScanLog, with_poses
@@ -21,7 +21,12 @@ from tilestream.settings import LogOptions
 
 __all__ = ["LOG_FORMATS", "ScanLog", "ScanSelection", "is_log", "open_log", "write_log"]
 
-LOG_FORMATS: tuple[Format[Recording], ...] = (mcap.FORMAT,)
+LOG_FORMATS: tuple[Format[Recording], ...] = (
+    mcap.FORMAT,
+    rosbag2.FORMAT,
+    ros_bags.DB3,
+    ros_bags.BAG,
+)
 """What `open_log` reads. `formats.FORMATS` has each of them too, as a drive that becomes a map."""
 
 
