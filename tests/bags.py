@@ -3,7 +3,7 @@
 import shutil
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 import yaml
@@ -60,17 +60,26 @@ def write_db3(path: Path, messages: Iterable[Raw]) -> Path:
     return path
 
 
+def types(name: str) -> Any:
+    """The types of a version of ROS as rosbags has them, and tf."""
+    typesys = pytest.importorskip("rosbags.typesys", reason="needs the extra ros")
+    store = typesys.get_typestore(typesys.Stores[name])
+    tf = "tf2_msgs/msg/TFMessage"
+    if tf not in store.types:
+        text = "geometry_msgs/TransformStamped[] transforms"
+        store.register(typesys.get_types_from_msg(text, tf))
+    return store
+
+
 def as_ros1(messages: Iterable[Raw]) -> list[Raw]:
     """The same, as ROS 1 writes them."""
-    typesys = pytest.importorskip("rosbags.typesys", reason="needs the extra ros")
-    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    store = types("ROS2_HUMBLE")
     return [m._replace(data=bytes(store.cdr_to_ros1(m.data, m.type))) for m in messages]
 
 
 def write_bag(path: Path, messages: Iterable[Raw], compression: str = "") -> Path:
     rosbag1 = pytest.importorskip("rosbags.rosbag1", reason="needs the extra ros")
-    typesys = pytest.importorskip("rosbags.typesys", reason="needs the extra ros")
-    store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
+    store = types("ROS1_NOETIC")
     path.unlink(missing_ok=True)
     writer = rosbag1.Writer(path)
     if compression:

@@ -14,7 +14,7 @@ from tilestream.errors import SourceError, UsageError
 from tilestream.formats.drive import open_drive
 from tilestream.formats.logs import ScanSelection, open_log
 from tilestream.formats.logs.deskew import deskew
-from tilestream.formats.logs.drivers import time_offsets
+from tilestream.formats.logs.drivers import span_deg, time_offsets
 from tilestream.formats.logs.mcap_file import McapFile
 from tilestream.formats.logs.poses import PoseStatus
 from tilestream.records import Scan
@@ -344,20 +344,63 @@ def test_poses_in_the_map_go_before_others_however_many(tmp_path: Path) -> None:
     )
 
 
-def test_the_topic_with_the_most_clouds_is_taken_and_noted(tmp_path: Path) -> None:
-    messages = [
-        logs.odometry_at(START, pose()),
-        logs.cloud_at(START, topic="/map_cloud"),
-        logs.cloud_at(START),
-        logs.cloud_at(START),
-    ]
-    log = open_log(logs.write(tmp_path / "a.mcap", messages))
-    assert log.points_topic == "/points"
-    assert any("/map_cloud" in note for note in log.notes)
-    tie = logs.write(tmp_path / "tie.mcap", [*messages, messages[1]])
-    with pytest.raises(SourceError, match=r"/map_cloud, /points; name one as points_topic"):
+# --- which clouds are the lidar's
+
+
+def turn(count: int, degrees: float = 360.0, seed: int = 0) -> np.ndarray:
+    """Points that a lidar sees which looks so far round."""
+    azimuth = np.radians(np.linspace(-degrees / 2, degrees / 2, count))
+    r = np.random.default_rng(seed).uniform(3.0, 40.0, count)
+    return np.column_stack([r * np.cos(azimuth), r * np.sin(azimuth), np.ones(count)])
+
+
+def several(path: Path, *topics: tuple[str, str, np.ndarray, int]) -> Path:
+    """A log with so many clouds of the same points on each topic: name, frame, points."""
+    messages = [logs.odometry_at(START + i * SECOND // 10, pose(x=i)) for i in range(10)]
+    for topic, frame, points, count in topics:
+        stamps = [START + i * SECOND // 10 for i in range(count)]
+        messages += [logs.cloud_at(t, points, topic, frame=frame) for t in stamps]
+    return logs.write(path, messages)
+
+
+@pytest.mark.parametrize(
+    ("other", "told"),
+    [
+        (("/camera", "camera", turn(900, 80.0), 10), "/camera (10, 80 deg)"),
+        (("/packets", "lidar", turn(900, 40.0), 10), "/packets (10, 40 deg)"),
+        (("/map_cloud", "map", turn(900), 1), "/map_cloud (1, 360 deg)"),
+        (("/radar", "radar", turn(60), 10), "/radar (10, 354 deg)"),
+        (("/ground", "lidar", turn(199), 10), "/ground (10, 358 deg)"),
+        (("/empty", "lidar", np.zeros((9, 3)), 10), "/empty (10, 0 deg)"),
+    ],
+)
+def test_the_clouds_that_look_like_turns_of_a_lidar_are_taken(
+    other: tuple[str, str, np.ndarray, int], told: str, tmp_path: Path
+) -> None:
+    lidar = ("/points", "lidar", turn(200), 10)
+    for topics in ([lidar, other], [other, lidar]):
+        log = open_log(several(tmp_path / "a.mcap", *topics))
+        assert log.points_topic == "/points"
+        assert log.notes == (f"of several topics of clouds took /points (10, 358 deg), not {told}",)
+
+
+def test_clouds_that_are_equally_good_have_to_be_named(tmp_path: Path) -> None:
+    left, right = (turn(200, seed=i) for i in range(2))
+    tie = several(tmp_path / "a.mcap", ("/left", "left", left, 9), ("/right", "right", right, 10))
+    with pytest.raises(SourceError, match=r"/left, /right; name one as points_topic"):
         open_log(tie)
-    assert len(open_log(tie, LogOptions(points_topic="/map_cloud"))) == 2
+    copies = several(tmp_path / "b.mcap", ("/b", "lidar", left, 9), ("/a", "lidar", left, 9))
+    with pytest.raises(SourceError, match=r"/a, /b; name one as points_topic"):
+        open_log(copies)
+    assert len(open_log(copies, LogOptions(points_topic="/a"))) == 9
+
+
+def test_a_scan_that_is_no_full_turn_is_noted(tmp_path: Path) -> None:
+    log = open_log(several(tmp_path / "a.mcap", ("/points", "lidar", turn(500, 120.0), 10)))
+    assert log.notes == ("scans span 120 degrees, not a full turn",)
+    one_side = turn(500, 120.0) @ Rotation.from_euler("z", 170.0, degrees=True).as_matrix().T
+    assert span_deg(one_side) == pytest.approx(120.0)
+    assert span_deg(turn(500)[:1]) == 0.0
 
 
 def test_scans_come_in_order_of_their_stamps(tmp_path: Path) -> None:
