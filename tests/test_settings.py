@@ -180,7 +180,7 @@ def test_a_mount_is_metres_and_degrees(given: Any) -> None:
 
 @pytest.mark.parametrize("wrong", ["1,2,3", "1,2,3,0,0,0,1", "1,2,3,0,0,x", "", "1,2,3,0,0,inf", 7])
 def test_what_is_no_mount_is_refused(wrong: Any) -> None:
-    with pytest.raises(UsageError, match="extrinsic is .*: give x,y,z,roll,pitch,yaw"):
+    with pytest.raises(UsageError, match=r"extrinsic is .*: give x,y,z,roll,pitch,yaw"):
         LogOptions(extrinsic=wrong)
 
 

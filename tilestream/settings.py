@@ -75,7 +75,7 @@ class LogOptions(Settings):
     their scans make one each, in the frame of the first; not given: found by what looks like the
     full turn of a lidar."""
     pose_topic: str | None = None
-    """Topic of the poses in a log; not given: found by type."""
+    """Topic of the poses in a log, also one of tf; not given: found by type."""
     map_frame: str | None = None
     """Frame of a log that is the map's; not given: `map`, or the one root of its frames that is not
     an odometry's."""
