@@ -97,9 +97,14 @@ def split_in(folder: Path, messages: Sequence[Raw], files: int, storage: str = "
     """A rosbag2 folder of so many files, one after the other in time."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
+    return fill(folder, messages, files, storage)
+
+
+def fill(folder: Path, messages: Sequence[Raw], files: int, storage: str = "mcap") -> Path:
+    """A folder that is there made a rosbag2."""
     write, ending = {"mcap": (write_mcap, "mcap"), "sqlite3": (write_db3, "db3")}[storage]
     size = -(-len(messages) // files)
-    names = [f"{folder.name}_{i}.{ending}" for i in range(files)]
+    names = [f"bag_{i}.{ending}" for i in range(files)]
     for i, name in enumerate(names):
         write(folder / name, messages[i * size : (i + 1) * size])
     write_metadata(folder, names, storage)

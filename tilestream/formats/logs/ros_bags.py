@@ -4,15 +4,23 @@ Needs the extra `ros` (rosbags, which reads both without ROS). Neither format ha
 is indexed as a whole when it is opened, in some 100 bytes of memory per message.
 """
 
+import bz2
+import errno
+import io
+import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tilestream.errors import CorruptSourceError, UnknownFormatError, foreign_errors
+import lz4.frame
+
+from tilestream.errors import COPY_AGAIN, CorruptSourceError, UnknownFormatError, foreign_errors
 from tilestream.formats.logs import ros
 from tilestream.formats.logs.base import Recording
+from tilestream.formats.logs.mcap_chunk import LARGEST_RECORD
 from tilestream.formats.logs.messages import Message, Topic
 from tilestream.formats.logs.recording import record
 from tilestream.formats.registry import Format
@@ -25,6 +33,8 @@ except ModuleNotFoundError as missing:
         raise
     rosbag1 = rosbag2 = None  # the extra is not installed
 
+Unpack = Callable[[bytes], bytes]
+"""Unpacks a chunk."""
 CHUNK_BYTES = 1 << 20
 """What a bag of ROS 1 unpacks at once besides a message [bytes]: a chunk is closed at 768 KB."""
 
@@ -101,8 +111,16 @@ class _RosbagsFile(AbstractContextManager["_RosbagsFile"]):
             counts[connection.topic, of_type, encoding] += connection.msgcount
         return tuple(Topic(*named, count) for named, count in sorted(counts.items()))
 
-    def _errors(self) -> AbstractContextManager[None]:
-        return foreign_errors(CorruptSourceError, f"{self.path}: cannot be read by rosbags")
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        what = f"{self.path}: cannot be read by rosbags"
+        try:
+            with foreign_errors(CorruptSourceError, what):
+                yield
+        except OSError as error:
+            if error.errno not in (None, errno.EINVAL):  # not of the machine, but of a false offset
+                raise
+            raise CorruptSourceError(f"{what} ({error}); {COPY_AGAIN}") from error
 
 
 class Db3File(_RosbagsFile):
@@ -126,7 +144,48 @@ class BagFile(_RosbagsFile):
     def __init__(self, path: str, *, topics: bool = True) -> None:
         if rosbag1 is None:
             raise _without_extra(path)
-        super().__init__(path, rosbag1.Reader(path), topics=topics)
+        super().__init__(path, rosbag1.Reader(_Bounded(Path(path))), topics=topics)
+        for at, chunk in self._reader.chunks.items():
+            self._reader.chunks[at] = chunk._replace(decompressor=_bounded(chunk.decompressor))
+
+
+@dataclass(frozen=True)
+class _Bounded:
+    """A path whose file gives no more at once than it has, whatever is claimed to be there."""
+
+    path: Path
+
+    def exists(self) -> bool:
+        """Whether there is a file."""
+        return self.path.exists()
+
+    def open(self, mode: str) -> "_BoundedFile":
+        """The file, open for reading."""
+        return _BoundedFile(io.FileIO(self.path, mode))
+
+
+class _BoundedFile(io.BufferedReader):
+    def read(self, size: int | None = -1, /) -> bytes:
+        held = os.fstat(self.fileno()).st_size
+        return super().read(held if size is None or size < 0 else min(size, held))
+
+
+def _bounded(unpack: Unpack) -> Unpack:
+    """What unpacks a chunk of a bag, and never to more than any chunk holds."""
+    unpackers = {
+        bz2.decompress: bz2.BZ2Decompressor,
+        lz4.frame.decompress: lz4.frame.LZ4FrameDecompressor,
+    }
+    if unpack not in unpackers:
+        return unpack
+
+    def within(packed: bytes) -> bytes:
+        data = bytes(unpackers[unpack]().decompress(packed, max_length=LARGEST_RECORD + 1))
+        if len(data) > LARGEST_RECORD:
+            raise ValueError(f"a chunk unpacks to more than {LARGEST_RECORD} bytes")
+        return data
+
+    return within
 
 
 def _without_extra(path: str) -> UnknownFormatError:

@@ -35,7 +35,8 @@ def open_bag(path: str, options: LogOptions) -> Recording:
     names = bag.get("relative_file_paths")
     if not isinstance(names, list) or not names or not all(isinstance(n, str) for n in names):
         raise CorruptSourceError(f"{place}: lists no files; `ros2 bag reindex` writes it anew")
-    files = [Path(path) / Path(name).name for name in names]  # older ones name the folder too
+    # older versions name the folder too
+    files = [Path(path) / name for name in dict.fromkeys(Path(name).name for name in names)]
     missing = [file.name for file in files if not file.is_file()]
     if missing:
         raise CorruptSourceError(
