@@ -11,14 +11,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from logs import SECOND, START, pose
+from points import far_points
 
 import tilestream as ts
 from tilestream.cli import run
+from tilestream.crs import same
 from tilestream.errors import CorruptSourceError, SourceError, UnknownFormatError
 from tilestream.formats import expand_sources
 from tilestream.formats.logs import is_log, open_log
+from tilestream.formats.points.las import write_las
 from tilestream.formats.registry import state_of
 from tilestream.formats.routes import read_route
+from tilestream.pipeline.jobs.sources import crs_of_map
 from tilestream.pipeline.stages.drive_scans import Reading
 from tilestream.settings import LogOptions
 
@@ -91,7 +95,15 @@ def test_a_bag_is_a_source_of_a_map_a_drive_and_a_route(bag: Path, tmp_path: Pat
     np.testing.assert_allclose(route.positions[0, :2], (pose(x=20.0, y=5.0) @ MOUNT)[:2, 3])
 
 
-def test_the_main_job_takes_folders_by_a_glob(bag: Path, tmp_path: Path) -> None:
+def test_the_crs_of_a_map_is_that_of_the_files_beside_a_bag(bag: Path, tmp_path: Path) -> None:
+    write_las(tmp_path / "block.las", far_points(50), crs="EPSG:6677")
+    found = crs_of_map([str(tmp_path / "b*")], str(tmp_path / "map.zarr"), None)
+    assert found is not None
+    assert same(found, "EPSG:6677")
+    assert crs_of_map([str(bag)], str(tmp_path / "map.zarr"), None) is None
+
+
+def test_ingest_takes_folders_by_a_glob(bag: Path, tmp_path: Path) -> None:
     made = [str(tmp_path / "b*"), "--store", str(tmp_path / "map.zarr"), "--every", "2"]
     assert run(["ingest", *made, "--offset", "1"]) == 0
     assert ts.open_store(tmp_path / "map.zarr").sources()[0]["points"] == 6 * 200

@@ -61,7 +61,8 @@ class LidarPoses:
         parent = edge[0] or self._unnamed_parent(track.topic)
         map_frame = self._map_frame(track.topic, parent)
         child = self._posed(track.topic, (parent, edge[1]), poses)
-        self._check_clouds({parent, map_frame, *self.frames.above(parent)})
+        if child != self.lidar:
+            self._check_clouds({parent, map_frame, *self.frames.above(parent)})
         own = ((parent, child), (child, parent)) if child else ()
         self._check_against_tf(track.topic, (parent, child), map_frame, poses)
         T = poses.T_map_lidar

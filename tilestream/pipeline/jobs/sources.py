@@ -1,7 +1,7 @@
 """The sources of a map: each opened as far as its header, and what became of it."""
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -149,6 +149,15 @@ def crs_of_map(sources: Iterable[str], url: str, asked: str | None) -> str | Non
     try:
         return open_store(url).settings.crs
     except StoreNotFoundError:
-        named = [source for source in sources if not is_log(source)]
+        named = list(_without_logs(sources))
         settings = IngestSettings(crs=asked)
         return with_crs(settings, examine_all(named, settings)).crs if named else asked
+
+
+def _without_logs(sources: Iterable[str]) -> Iterator[str]:
+    """The sources that name no log; of a glob that names some, the files that are none."""
+    for source in sources:
+        if not is_log(source):
+            yield source
+        elif not Path(source).exists():
+            yield from (path for path in expand_sources(source) if not is_log(path))
