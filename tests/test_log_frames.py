@@ -10,12 +10,19 @@ from hypothesis import strategies as st
 from logs import SECOND, START, pose
 from scipy.spatial.transform import Rotation
 
-from tilestream.errors import PoseError
+import tilestream as ts
+from tilestream.errors import PoseError, SourceError
 from tilestream.formats.logs import ScanLog, open_log
 from tilestream.formats.logs.frames import Frames
 from tilestream.formats.logs.pose_tracks import PoseTrack
 from tilestream.formats.logs.poses import PoseStatus, interpolate, inverse
 from tilestream.formats.logs.ros import TF, Pose
+from tilestream.formats.points.pcd import write_pcd
+from tilestream.pipeline.jobs.localize import plan_localize
+from tilestream.pipeline.jobs.run_inputs import inputs_of
+from tilestream.pipeline.jobs.run_settings import RunSettings
+from tilestream.pipeline.stages.drive_scans import Reading
+from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.records import Trajectory
 from tilestream.settings import LogOptions
 
@@ -398,3 +405,53 @@ def test_the_fastest_that_a_vehicle_drives_can_be_said(tmp_path: Path) -> None:
     log = opened(tmp_path, odometries(T, "map", "lidar"), between, max_speed_mps=80.0)
     assert log.posed.all()
     assert log.notes == ()
+
+
+# --- every consumer
+
+
+def test_a_job_reads_each_log_by_its_own_frames(tmp_path: Path) -> None:
+    path = logs.write(tmp_path / "a.mcap", [*odometries(moving(0), "odom", "lidar"), *clouds()])
+    write_pcd(tmp_path / "map.pcd", logs.STREET.astype(float))
+    sources = {"sources": [str(tmp_path / "map.pcd")]}
+    made = {"out": str(tmp_path / "out"), "model": {"recipe": "physics"}}
+    drive = {"log": str(path), "map_frame": "odom"}
+    of_drive = RunSettings(**made, map=sources, drives=[drive])
+    of_map = RunSettings(**made, map={**sources, "map_frame": "odom"}, routes=[str(path)])
+    for settings in (of_drive, of_map):
+        (route,) = inputs_of(settings, None, None).routes
+        np.testing.assert_allclose(route.positions[0, :2], moving(0)[0, :2, 3])
+    neither = RunSettings(**made, map=sources, drives=[{"log": str(path)}])
+    with pytest.raises(SourceError, match=r"--map-frame odom\) if the map"):
+        inputs_of(neither, None, None)
+
+
+def test_another_mount_makes_other_labels_and_another_map(tmp_path: Path) -> None:
+    path = logs.write(tmp_path / "a.mcap", [*odometries(moving(0), "map", "base"), *clouds()])
+    mounts = [LogOptions(extrinsic=f"0,0,{z},0,0,0") for z in (1.0, 1.5)]
+    stores = [tmp_path / f"{i}.zarr" for i in range(2)]
+    for mount, url in zip(mounts, stores, strict=True):
+        ts.ingest(path, url, log_options=mount)
+    z = [ts.open_store(url).tile_at(*moving(0)[0, :2, 3]).points()[:, 2].min() for url in stores]
+    assert z[1] - z[0] == pytest.approx(0.5, abs=0.02)
+    states = [ts.open_store(url).sources()[0]["state"] for url in stores]
+    assert states[0] != states[1]
+    plans = [
+        plan_localize(
+            MapPlan.of_store(ts.open_store(stores[0])),
+            Reading(str(path), mount),
+            tmp_path / "out",
+            cell_size=2.0,
+            spacing=1.0,
+            registration=ts.RegistrationSettings(),
+            starts=ts.StartSettings(),
+            true_pose="log",
+            scans=ts.ScanSelection(),
+            starts_per_task=None,
+            memory=10**9,
+        )
+        for mount in mounts
+    ]
+    a, b = ({task.identity for task in plan.tasks if task.stage == "label"} for plan in plans)
+    assert a
+    assert not a & b

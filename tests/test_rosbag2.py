@@ -175,6 +175,13 @@ def test_messages_of_one_time_are_told_apart(whole: Path, tmp_path: Path) -> Non
             np.testing.assert_array_equal(a.points, b.points)
 
 
+@pytest.mark.parametrize("name", ["a.mcap.zstd", "a.db3.zstd", "a.bag.bz2"])
+def test_a_compressed_file_says_what_unpacks_it(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(b"1234")
+    with pytest.raises(UnknownFormatError, match=r"unpack it first \((zstd -d|bunzip2)\)"):
+        open_log(tmp_path / name)
+
+
 @pytest.mark.parametrize("name", ["a.db3", "a.bag"])
 def test_without_the_extra_it_says_which(name: str, whole: Path, tmp_path: Path) -> None:
     write = {"a.db3": bags.write_db3, "a.bag": bags.write_bag}[name]
