@@ -1,5 +1,6 @@
 """Small files that would become large: each a claim, or a compression, that nobody must believe."""
 
+import bz2
 import io
 import json
 import re
@@ -115,6 +116,22 @@ def of_mcap(data: bytes) -> Iterator[bytes]:
     whole = mcap_of([chunk])
     at = len(whole) - 8 - 20
     yield whole[:at] + struct.pack("<QQI", 8, 0, 0) + whole[-8:]
+
+
+def of_bag(data: bytes) -> Iterator[bytes]:
+    """The first chunk of a bag replaced by one that unpacks to gigabytes."""
+    zeros = bz2.BZ2Compressor(9)
+    bomb = b"".join([*(zeros.compress(p) for p in pieces()), zeros.flush()])
+    at = data.index(b"compression=bz2")
+    start = data.index(b"BZh", at)
+    (size,) = struct.unpack_from("<I", data, start - 4)
+    for claim in (len(bomb), size):
+        yield data[: start - 4] + struct.pack("<I", claim) + bomb + data[start + size :]
+    grown = len(bomb) - size
+    moved = data[: start - 4] + struct.pack("<I", len(bomb)) + bomb + data[start + size :]
+    index = data.index(b"index_pos=") + 10
+    (was,) = struct.unpack_from("<Q", data, index)
+    yield moved[:index] + struct.pack("<Q", was + grown) + moved[index + 8 :]
 
 
 def pieces() -> Iterator[bytes]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import bags
 import fuzz_bombs as bombs
 import logs
 import numpy as np
@@ -218,6 +219,34 @@ def street(**options: Any) -> Callable[[Path], object]:
     return make
 
 
+def in_other(write: Callable[[Path, list[bags.Raw]], Path]) -> Callable[[Path], object]:
+    """The same log, in another container of ROS."""
+
+    def make(path: Path) -> None:
+        whole = logs.street_log(path.with_name("whole.mcap"), scans=4)
+        messages = bags.messages_of(whole)
+        whole.unlink()
+        write(path, messages)
+
+    return make
+
+
+def ros1_mcap(path: Path, messages: list[bags.Raw]) -> Path:
+    return bags.write_mcap(path, bags.as_ros1(messages), "ros1")
+
+
+def bz2_bag(path: Path, messages: list[bags.Raw]) -> Path:
+    return bags.write_bag(path, messages, "BZ2")
+
+
+def write_folder(path: Path) -> None:
+    in_other(lambda place, messages: bags.fill(place.parent, messages, 2))(path)
+
+
+def folder(path: Path) -> Iterator[object]:
+    return log(path.parent)
+
+
 def of_points(name: str, file: str, write: Callable[..., object], **more: Any) -> Reader:
     return Reader(name, file, lambda path: write(path, far_points(200)), points, **more)
 
@@ -260,6 +289,11 @@ READERS = (
     ),
     Reader("MCAP plain", "a.mcap", street(compression=CompressionType.NONE, **NO_CRC), log),
     Reader("MCAP no chunks", "a.mcap", street(use_chunking=False, **NO_CRC), log),
+    Reader("MCAP of ROS 1", "a.mcap", in_other(ros1_mcap), log, in_chunks),
+    Reader("rosbag2 metadata", "metadata.yaml", write_folder, folder, bombs=bombs.of_yaml),
+    Reader("rosbag2 sqlite3", "a.db3", in_other(bags.write_db3), log),
+    Reader("ROS 1 bag", "a.bag", in_other(bags.write_bag), log),
+    Reader("ROS 1 bag, bz2", "a.bag", in_other(bz2_bag), log, bombs=bombs.of_bag),
     of_routes("GeoJSON", "a.geojson", lambda p: geojson(p, line([[0, 0], [9, 1], [20, 0]])),
               mutate=in_json, bombs=bombs.of_json),
     of_routes("CSV", "a.csv", as_csv, bombs=bombs.of_rows),

@@ -44,7 +44,7 @@ KNOWN_ONLY_BY = {
     "typer": {"cli"},
     "jinja2": {"report"},
 }
-OF_FORMATS = re.compile(r"tilestream\.formats\.logs\.(mcap|ros2)")
+OF_FORMATS = re.compile(r"tilestream\.formats\.logs\.(mcap|ros)")
 """One format of logs: everything else reads any log, through `formats.logs`."""
 
 

@@ -37,7 +37,11 @@ def settings_classes(base: type[Settings] = Settings) -> Iterator[type[Settings]
 def settings_written() -> set[str]:
     """Names of the settings classes, read from the code itself."""
     text = "\n".join(path.read_text("utf-8") for path in ROOT.rglob("*.py"))
-    return set(re.findall(r"^class (\w+)\((?:\w*Settings(?:, )?)+\):", text, flags=re.MULTILINE))
+    return set(
+        re.findall(
+            r"^class (\w+)\((?:\w*(?:Settings|LogOptions)(?:, )?)+\):", text, flags=re.MULTILINE
+        )
+    )
 
 
 @pytest.mark.parametrize("path", sorted(ROOT.rglob("*.py")), ids=lambda p: str(p.relative_to(ROOT)))

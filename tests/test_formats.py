@@ -387,6 +387,8 @@ def test_the_formats_print_for_a_help_text() -> None:
         ".ply",
         ".e57",
         ".mcap",
+        ".db3",
+        ".bag",
     }
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import bags
 import logs
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from tilestream.formats.drive import open_drive
 from tilestream.formats.logs import LOG_FORMATS, ScanSelection, is_log, open_log, write_log
 from tilestream.formats.logs.poses import PoseStatus, transform
 from tilestream.records import Scan, Trajectory
+from tilestream.settings import LogOptions
 
 Write = Callable[[Path, list[Scan], Trajectory], Path]
 """Writes scans and poses as a log in a folder, and says where."""
@@ -52,7 +54,32 @@ def write_ours(folder: Path, scans: list[Scan], poses: Trajectory) -> Path:
     return folder / "a.mcap"
 
 
-CASES: dict[str, Write] = {"mcap": write_with_ros, "mcap, ours": write_ours}
+def in_other(write: Callable[[Path, list[bags.Raw]], Path], name: str) -> Write:
+    """The messages that ROS would have written, in another container."""
+
+    def made(folder: Path, scans: list[Scan], poses: Trajectory) -> Path:
+        whole = write_with_ros(folder, scans, poses)
+        messages = bags.messages_of(whole)
+        whole.unlink()
+        return write(folder / name, messages)
+
+    return made
+
+
+CASES: dict[str, Write] = {
+    "mcap": write_with_ros,
+    "mcap, ours": write_ours,
+    "mcap of ROS 1": in_other(
+        lambda path, messages: bags.write_mcap(path, bags.as_ros1(messages), "ros1"), "a.mcap"
+    ),
+    "rosbag2, mcap": in_other(lambda path, messages: bags.split_in(path, messages, 3), "a"),
+    "rosbag2, sqlite3": in_other(
+        lambda path, messages: bags.split_in(path, messages, 2, "sqlite3"), "a"
+    ),
+    "db3": in_other(bags.write_db3, "a.db3"),
+    "bag": in_other(bags.write_bag, "a.bag"),
+    "bag, lz4": in_other(lambda p, messages: bags.write_bag(p, messages, "LZ4"), "a.bag"),
+}
 
 
 def street(count: int = N, seed: int = 5) -> tuple[list[Scan], Trajectory]:
@@ -186,7 +213,7 @@ def test_scans_between_poses_are_posed_and_others_skipped(name: str, tmp_path: P
     np.testing.assert_allclose(found[1.5], pose(x=3.0), atol=1e-12)
     assert np.isnan(log.T_map_lidar[5]).all()
     assert open_drive(path).info().points == 4 * 200
-    assert open_log(path, max_gap_s=3.0).posed.sum() == 9
+    assert open_log(path, LogOptions(max_gap_s=3.0)).posed.sum() == 9
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -312,8 +339,8 @@ def test_what_is_no_log_says_what_is(tmp_path: Path) -> None:
     known = str(LOG_FORMATS[0]).replace("(", r"\(").replace(")", r"\)")
     with pytest.raises(SourceNotFoundError, match="no such file"):
         open_log(tmp_path / "none.mcap")
-    (tmp_path / "a.bag").write_bytes(b"#ROSBAG V2.0\n")
-    for other in (tmp_path, tmp_path / "a.bag"):
+    (tmp_path / "a.rrd").write_bytes(b"RRF2")
+    for other in (tmp_path, tmp_path / "a.rrd"):
         with pytest.raises(UnknownFormatError, match=f"supported are {known}"):
             open_log(other)
     (tmp_path / "text.mcap").write_text("# .PCD v0.7\n")

@@ -14,10 +14,11 @@ from tilestream.errors import SourceError, UsageError
 from tilestream.formats.drive import open_drive
 from tilestream.formats.logs import ScanSelection, open_log
 from tilestream.formats.logs.deskew import deskew
-from tilestream.formats.logs.drivers import time_offsets
+from tilestream.formats.logs.drivers import span_deg, time_offsets
 from tilestream.formats.logs.mcap_file import McapFile
 from tilestream.formats.logs.poses import PoseStatus
 from tilestream.records import Scan
+from tilestream.settings import LogOptions
 
 MAKES: dict[str, dict[str, Any]] = {
     "zstd": {"chunk_size": 4096, "compression": CompressionType.ZSTD},
@@ -116,7 +117,7 @@ def test_every_second_scan_maps_and_the_others_localize(drive: Path) -> None:
 
 def test_a_slice_reads_only_its_chunks(drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     log = open_log(drive)
-    chunks = set(log.reader.places[10:15, 0].tolist())
+    chunks = set(log.reader.places[10:15, 1].tolist())
     read: list[int] = []
     unpack = McapFile.unpack
 
@@ -307,76 +308,23 @@ def test_no_scan_has_a_pose_over_a_jump(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "make"),
+    ("kind", "make", "frame"),
     [
-        ("nav_msgs/msg/Odometry", logs.odometry),
-        ("geometry_msgs/msg/PoseStamped", logs.pose_stamped),
-        ("geometry_msgs/msg/PoseWithCovarianceStamped", logs.pose_with_covariance),
-        ("tf2_msgs/msg/TFMessage", lambda t, T: logs.transform(t, "map", "lidar", T)),
+        ("nav_msgs/msg/Odometry", logs.odometry, None),
+        ("geometry_msgs/msg/PoseStamped", logs.pose_stamped, "lidar"),
+        ("geometry_msgs/msg/PoseWithCovarianceStamped", logs.pose_with_covariance, "lidar"),
+        ("tf2_msgs/msg/TFMessage", lambda t, T: logs.transform(t, "map", "lidar", T), None),
     ],
 )
-def test_poses_of_every_type(kind: str, make: Any, tmp_path: Path) -> None:
+def test_poses_of_every_type(kind: str, make: Any, frame: str | None, tmp_path: Path) -> None:
     times = [START + i * SECOND // 10 for i in range(5)]
     messages = [(t, "/where", kind, make(t, pose(x=t % 7, yaw=0.3))) for t in times]
     path = logs.write(tmp_path / "a.mcap", [*messages, *(logs.cloud_at(t) for t in times)])
-    log = open_log(path)
+    log = open_log(path, LogOptions(pose_frame=frame))
     assert log.pose_topic == "/where"
     assert log.posed.all()
     for t, T in zip(times, log.T_map_lidar, strict=True):
         np.testing.assert_allclose(T, pose(x=t % 7, yaw=0.3), atol=1e-12)
-
-
-def test_static_transforms_lead_from_the_vehicle_to_the_lidar(tmp_path: Path) -> None:
-    T_base_mast, T_mast_lidar = pose(x=1.0, z=1.5, yaw=0.2), pose(y=0.3, z=0.4, yaw=-0.1)
-    T_map_base = pose(x=100.0, y=50.0, yaw=1.0)
-    T_lidar_mast = np.linalg.inv(T_mast_lidar)  # recorded against the direction of the chain
-    path = logs.write(
-        tmp_path / "a.mcap",
-        [
-            logs.static_tf("base", "mast", T_base_mast),
-            logs.static_tf("lidar", "mast", T_lidar_mast),
-            logs.odometry_at(START, T_map_base, child="base"),
-            logs.cloud_at(START),
-        ],
-    )
-    log = open_log(path)
-    expected = T_map_base @ T_base_mast @ T_mast_lidar
-    np.testing.assert_allclose(log.T_map_lidar[0], expected, atol=1e-12)
-    assert any("base" in note and "static" in note for note in log.notes)
-
-
-def test_tf_composes_moving_and_static_transforms(tmp_path: Path) -> None:
-    messages = [logs.static_tf("base", "lidar", pose(z=2.0, yaw=0.5))]
-    for i in range(0, 11, 2):  # 5 Hz
-        t = START + i * SECOND // 10
-        messages.append(logs.tf_at(t, "map", "odom", pose(x=10.0, y=0.1 * i)))
-    for i in range(1, 9):  # 10 Hz, starts later, ends earlier
-        t = START + i * SECOND // 10
-        messages.append(logs.tf_at(t, "odom", "base", pose(x=float(i))))
-    messages += [logs.cloud_at(START + i * SECOND // 10) for i in range(11)]
-    log = open_log(logs.write(tmp_path / "a.mcap", messages))
-    before, after = PoseStatus.BEFORE, PoseStatus.AFTER
-    assert log.pose_status.tolist() == [before, *[PoseStatus.POSED] * 8, after, after]
-    for i in range(1, 9):
-        expected = pose(x=10.0 + i, y=0.1 * i, z=2.0, yaw=0.5)
-        np.testing.assert_allclose(log.T_map_lidar[i], expected, atol=1e-9)
-
-
-def test_a_pose_without_a_frame_is_taken_as_the_lidars_and_it_says_so(tmp_path: Path) -> None:
-    posed = "geometry_msgs/msg/PoseStamped"
-    path = logs.write(
-        tmp_path / "a.mcap",
-        [
-            logs.static_tf("base", "lidar", pose(z=2.0)),
-            (START, "/pose", posed, logs.pose_stamped(START, pose(x=5.0))),
-            logs.cloud_at(START),
-        ],
-    )
-    log = open_log(path)
-    np.testing.assert_allclose(log.T_map_lidar[0], pose(x=5.0), atol=1e-12)
-    assert any("taken as those of the lidar" in note for note in log.notes)
-    named = open_log(path, pose_frame="base")
-    np.testing.assert_allclose(named.T_map_lidar[0], pose(x=5.0, z=2.0), atol=1e-12)
 
 
 def test_poses_in_the_map_go_before_others_however_many(tmp_path: Path) -> None:
@@ -391,23 +339,68 @@ def test_poses_in_the_map_go_before_others_however_many(tmp_path: Path) -> None:
     log = open_log(path)
     assert log.pose_topic == "/localization"
     assert any("/wheels" in note for note in log.notes)
-    assert open_log(path, pose_topic="/wheels").pose_topic == "/wheels"
+    assert (
+        open_log(path, LogOptions(pose_topic="/wheels", map_frame="odom")).pose_topic == "/wheels"
+    )
 
 
-def test_the_topic_with_the_most_clouds_is_taken_and_noted(tmp_path: Path) -> None:
-    messages = [
-        logs.odometry_at(START, pose()),
-        logs.cloud_at(START, topic="/map_cloud"),
-        logs.cloud_at(START),
-        logs.cloud_at(START),
-    ]
-    log = open_log(logs.write(tmp_path / "a.mcap", messages))
-    assert log.points_topic == "/points"
-    assert any("/map_cloud" in note for note in log.notes)
-    tie = logs.write(tmp_path / "tie.mcap", [*messages, messages[1]])
-    with pytest.raises(SourceError, match=r"/map_cloud, /points; name one as points_topic"):
+# --- which clouds are the lidar's
+
+
+def turn(count: int, degrees: float = 360.0, seed: int = 0) -> np.ndarray:
+    """Points that a lidar sees which looks so far round."""
+    azimuth = np.radians(np.linspace(-degrees / 2, degrees / 2, count))
+    r = np.random.default_rng(seed).uniform(3.0, 40.0, count)
+    return np.column_stack([r * np.cos(azimuth), r * np.sin(azimuth), np.ones(count)])
+
+
+def several(path: Path, *topics: tuple[str, str, np.ndarray, int]) -> Path:
+    """A log with so many clouds of the same points on each topic: name, frame, points."""
+    messages = [logs.odometry_at(START + i * SECOND // 10, pose(x=i)) for i in range(10)]
+    for topic, frame, points, count in topics:
+        stamps = [START + i * SECOND // 10 for i in range(count)]
+        messages += [logs.cloud_at(t, points, topic, frame=frame) for t in stamps]
+    return logs.write(path, messages)
+
+
+@pytest.mark.parametrize(
+    ("other", "told"),
+    [
+        (("/camera", "camera", turn(900, 80.0), 10), "/camera (10, 80 deg)"),
+        (("/packets", "lidar", turn(900, 40.0), 10), "/packets (10, 40 deg)"),
+        (("/map_cloud", "map", turn(900), 1), "/map_cloud (1, 360 deg)"),
+        (("/radar", "radar", turn(60), 10), "/radar (10, 354 deg)"),
+        (("/ground", "lidar", turn(199), 10), "/ground (10, 358 deg)"),
+        (("/empty", "lidar", np.zeros((9, 3)), 10), "/empty (10, 0 deg)"),
+    ],
+)
+def test_the_clouds_that_look_like_turns_of_a_lidar_are_taken(
+    other: tuple[str, str, np.ndarray, int], told: str, tmp_path: Path
+) -> None:
+    lidar = ("/points", "lidar", turn(200), 10)
+    for topics in ([lidar, other], [other, lidar]):
+        log = open_log(several(tmp_path / "a.mcap", *topics))
+        assert log.points_topic == "/points"
+        assert log.notes == (f"of several topics of clouds took /points (10, 358 deg), not {told}",)
+
+
+def test_clouds_that_are_equally_good_have_to_be_named(tmp_path: Path) -> None:
+    left, right = (turn(200, seed=i) for i in range(2))
+    tie = several(tmp_path / "a.mcap", ("/left", "left", left, 9), ("/right", "right", right, 10))
+    with pytest.raises(SourceError, match=r"/left, /right; name one as points_topic"):
         open_log(tie)
-    assert len(open_log(tie, points_topic="/map_cloud")) == 2
+    copies = several(tmp_path / "b.mcap", ("/b", "lidar", left, 9), ("/a", "lidar", left, 9))
+    with pytest.raises(SourceError, match=r"/a, /b; name one as points_topic"):
+        open_log(copies)
+    assert len(open_log(copies, LogOptions(points_topic="/a"))) == 9
+
+
+def test_a_scan_that_is_no_full_turn_is_noted(tmp_path: Path) -> None:
+    log = open_log(several(tmp_path / "a.mcap", ("/points", "lidar", turn(500, 120.0), 10)))
+    assert log.notes == ("scans span 120 degrees, not a full turn",)
+    one_side = turn(500, 120.0) @ Rotation.from_euler("z", 170.0, degrees=True).as_matrix().T
+    assert span_deg(one_side) == pytest.approx(120.0)
+    assert span_deg(turn(500)[:1]) == 0.0
 
 
 def test_scans_come_in_order_of_their_stamps(tmp_path: Path) -> None:

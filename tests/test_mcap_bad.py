@@ -27,6 +27,7 @@ from tilestream.errors import (
 )
 from tilestream.formats.drive import open_drive
 from tilestream.formats.logs import open_log
+from tilestream.settings import LogOptions
 
 
 @pytest.fixture(scope="module")
@@ -197,7 +198,7 @@ def test_without_clouds_the_topics_that_are_there_are_named(tmp_path: Path) -> N
     with pytest.raises(SourceError, match=r"no sensor_msgs/PointCloud2.*/chat.*/odometry"):
         open_log(path)
     with pytest.raises(SourceError, match=r"on topic /points.*/chat"):
-        open_log(path, points_topic="/points")
+        open_log(path, LogOptions(points_topic="/points"))
 
 
 def test_without_poses(tmp_path: Path) -> None:
@@ -207,7 +208,7 @@ def test_without_poses(tmp_path: Path) -> None:
         with pytest.raises(PoseError, match="no poses"):
             open_log(path)
         with pytest.raises(PoseError, match=r"no poses on topic /odom.*/points"):
-            open_log(path, pose_topic="/odom")
+            open_log(path, LogOptions(pose_topic="/odom"))
 
 
 def test_poses_that_are_no_poses(tmp_path: Path) -> None:
@@ -302,16 +303,16 @@ def test_a_message_that_ends_too_early(tmp_path: Path) -> None:
         open_log(path)
 
 
-def test_a_ros_1_log_is_refused(street: Path, tmp_path: Path) -> None:
-    path = tmp_path / "ros1.mcap"
+def test_what_is_not_encoded_as_ros_does_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "other.mcap"
     with path.open("wb") as stream:
         writer = logs.PlainWriter(stream)
-        writer.start("ros1")
-        schema = writer.register_schema("sensor_msgs/PointCloud2", "ros1msg", b"")
-        channel = writer.register_channel("/points", "ros1", schema)
+        writer.start("")
+        schema = writer.register_schema("sensor_msgs/PointCloud2", "protobuf", b"")
+        channel = writer.register_channel("/points", "protobuf", schema)
         writer.add_message(channel, START, b"12345678", START)
         writer.finish()
-    with pytest.raises(SourceError, match=r"'ros1'.*convert"):
+    with pytest.raises(SourceError, match=r"'protobuf'.*convert"):
         open_log(path)
 
 

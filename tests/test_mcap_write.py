@@ -12,6 +12,7 @@ from logs import SECOND, START, pose
 from tilestream.errors import PoseError, UsageError
 from tilestream.formats.logs import open_log, write_log
 from tilestream.records import Scan, Trajectory
+from tilestream.settings import LogOptions
 
 
 def made_scan(stamp_ns: int, seed: int, **without: None) -> Scan:
@@ -63,8 +64,8 @@ def test_truth_is_a_topic_of_its_own_that_must_be_named(tmp_path: Path) -> None:
     write_log(path, [made_scan(START, 0)], poses, truth=truth)
     with pytest.raises(PoseError, match=r"/ground_truth, /odometry; name one as pose_topic"):
         open_log(path)
-    assert open_log(path, pose_topic="/odometry").T_map_lidar[0, 1, 3] == 4e5
-    assert open_log(path, pose_topic="/ground_truth").T_map_lidar[0, 1, 3] == 4e5 + 0.25
+    assert open_log(path, LogOptions(pose_topic="/odometry")).T_map_lidar[0, 1, 3] == 4e5
+    assert open_log(path, LogOptions(pose_topic="/ground_truth")).T_map_lidar[0, 1, 3] == 4e5 + 0.25
 
 
 def test_a_log_given_up_half_way_is_not_there(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ import inspect
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
 import pytest
 
 import tilestream as ts
@@ -12,10 +13,14 @@ from tilestream.cli.app import COMMANDS, command_of
 from tilestream.cli.fields import help_of
 from tilestream.config import Settings
 from tilestream.errors import UsageError
+from tilestream.formats.registry import state_of
+from tilestream.marks import hash_of
+from tilestream.pipeline.stages.drive_scans import Reading
 from tilestream.sensor import sensor_of
 from tilestream.settings import (
     DriveSettings,
     LabelSettings,
+    LogOptions,
     MapSettings,
     PlaceSettings,
     RegistrationSettings,
@@ -80,6 +85,11 @@ def test_the_commands_have_settings_as_options() -> None:
         ("ingest", "from_s"),
         ("ingest", "map_leaf"),
         ("localize", "range_max"),
+        ("localize", "extrinsic"),
+        ("ingest", "map_frame"),
+        ("factors", "pose_frame"),
+        ("compare", "lidar_frame"),
+        ("info", "max_speed_mps"),
         ("localize", "matcher"),
         ("factors", "sensor"),
         ("compare", "matcher"),
@@ -152,3 +162,58 @@ def test_a_sensor_that_cannot_be_is_named_with_its_file(
     path.write_text(text.replace("{path}", str(path)))
     with pytest.raises(UsageError, match=rf"mine\.yaml: .*{told}"):
         sensor_of(str(path))
+
+
+@pytest.mark.parametrize(
+    "given",
+    ["1,0,1.8,0,0,90", " 1, 0 ,1.8,0,0,9e1", [1, 0, 1.8, 0, 0, 90], (1.0, 0, 1.8, 0, 0, 90)],
+)
+def test_a_mount_is_metres_and_degrees(given: Any) -> None:
+    options = LogOptions(extrinsic=given)
+    assert options == LogOptions(extrinsic="1,0,1.8,0,0,90")
+    assert LogOptions(**options.given) == options
+    assert options.mount is not None
+    x, y, z = options.mount.T_base_lidar[:3, 3]
+    assert (x, y, z) == (1.0, 0.0, 1.8)
+    np.testing.assert_allclose(options.mount.T_base_lidar[:3, 0], [0.0, 1.0, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize("wrong", ["1,2,3", "1,2,3,0,0,0,1", "1,2,3,0,0,x", "", "1,2,3,0,0,inf", 7])
+def test_what_is_no_mount_is_refused(wrong: Any) -> None:
+    with pytest.raises(UsageError, match=r"extrinsic is .*: give x,y,z,roll,pitch,yaw"):
+        LogOptions(extrinsic=wrong)
+
+
+def test_a_mount_is_that_of_one_lidar() -> None:
+    for one in ({"extrinsic": "1,0,1.8,0,0,90"}, {"lidar_frame": "front"}):
+        with pytest.raises(UsageError, match="has several lidars, /front,/rear"):
+            LogOptions(points_topic="/front,/rear", **one)
+
+
+def test_log_options_are_the_same_of_maps_drives_and_alone() -> None:
+    options = {"pose_topic": "/pose", "map_frame": "odom", "max_speed_mps": 90.0}
+    for settings in (MapSettings(**options), DriveSettings(log="a.mcap", **options)):
+        assert settings.log_options == LogOptions(**options)
+        assert settings.log_options.given == options
+    assert MapSettings(every=2).log_options == LogOptions()
+
+
+def test_what_changes_the_poses_of_a_log_changes_its_state(tmp_path: Any) -> None:
+    log = tmp_path / "a.mcap"
+    log.write_bytes(b"x")
+    names = ("beams", "range_max", "blind_rear_deg", "sweep_s", "points_topic", "pose_topic")
+    as_before = {"path": str(log), "deskew": False, **dict.fromkeys(names)}
+    assert Reading(str(log)).state == hash_of(as_before, *state_of(log))
+    named = Reading(str(log), LogOptions(pose_topic="/pose"))
+    assert named.state == hash_of({**as_before, "pose_topic": "/pose"}, *state_of(log))
+    others = [
+        {"extrinsic": "1,0,1.8,0,0,90"},
+        {"extrinsic": "1,0,1.8,0,0,91"},
+        {"map_frame": "odom"},
+        {"pose_frame": "base"},
+        {"lidar_frame": "lidar"},
+        {"max_gap_s": 2.0},
+        {"max_speed_mps": 90.0},
+    ]
+    states = {Reading(str(log), LogOptions(**other)).state for other in ({}, *others)}
+    assert len(states) == 1 + len(others)

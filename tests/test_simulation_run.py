@@ -24,7 +24,7 @@ from tilestream.pipeline.engine.stage import BASE_BYTES
 from tilestream.pipeline.jobs.simulate import plan_simulation, simulate
 from tilestream.pipeline.stages import simulated
 from tilestream.records import Scan
-from tilestream.settings import StartSettings
+from tilestream.settings import LogOptions, StartSettings
 from tilestream.simulation.city import City, build_city
 from tilestream.simulation.drive import motion_of, scans, traffic_of
 from tilestream.simulation.settings import (
@@ -400,7 +400,7 @@ def test_routes_are_read_by_their_names(made: Path, city: City) -> None:
 
 def test_readers_take_the_true_poses_and_not_the_odometry(made: Path, city: City) -> None:
     log = made / "logs" / "drive0" / "A.mcap"
-    found, believed = open_log(log), open_log(log, pose_topic="/odometry")
+    found, believed = open_log(log), open_log(log, LogOptions(pose_topic="/odometry"))
     assert found.pose_topic == "/ground_truth"
     assert len(found) == A
     assert found.posed.all()

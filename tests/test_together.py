@@ -16,6 +16,7 @@ from tilestream.formats.logs.together import APART_NS
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.pipeline.jobs.run_inputs import inputs_of
 from tilestream.pipeline.stages.drive_scans import Reading
+from tilestream.settings import LogOptions
 
 FRONT, REAR = pose(x=1.2, z=0.3), pose(x=-0.8, y=0.1, yaw=np.pi)
 """Where the two lidars are, in the frame of the vehicle."""
@@ -61,8 +62,8 @@ def two_lidars(path: Path, later: int = LATER, missing: tuple[int, ...] = ()) ->
 
 def test_points_of_all_lidars_lie_where_they_are_in_the_map(tmp_path: Path) -> None:
     path = two_lidars(tmp_path / "two.mcap")
-    log = open_log(path, points_topic="/front, /rear")
-    front, rear = (open_log(path, points_topic=topic) for topic in ("/front", "/rear"))
+    log = open_log(path, LogOptions(points_topic="/front, /rear"))
+    front, rear = (open_log(path, LogOptions(points_topic=topic)) for topic in ("/front", "/rear"))
     assert len(log) == SCANS
     np.testing.assert_array_equal(log.T_map_lidar, front.T_map_lidar)
     for one, ahead, back in zip(log.scans(), front.scans(), rear.scans(), strict=True):
@@ -79,7 +80,7 @@ def test_points_of_all_lidars_lie_where_they_are_in_the_map(tmp_path: Path) -> N
 
 
 def test_any_scans_in_any_order(tmp_path: Path) -> None:
-    log = open_log(two_lidars(tmp_path / "two.mcap"), points_topic="/front,/rear")
+    log = open_log(two_lidars(tmp_path / "two.mcap"), LogOptions(points_topic="/front,/rear"))
     whole = list(log.scans())
     for index, scan in zip((5, 0, 3), log.scans_at([5, 0, 3]), strict=True):
         np.testing.assert_array_equal(scan.points, whole[index].points)
@@ -87,7 +88,7 @@ def test_any_scans_in_any_order(tmp_path: Path) -> None:
 
 def test_a_scan_without_a_partner_is_left_out_and_noted(tmp_path: Path) -> None:
     path = two_lidars(tmp_path / "two.mcap", missing=(2, 3))
-    log = open_log(path, points_topic="/front,/rear")
+    log = open_log(path, LogOptions(points_topic="/front,/rear"))
     assert len(log) == SCANS - 2
     assert "2 of 8 scans left out" in log.notes[-1]
     assert log.info().points == log.point_counts.sum()
@@ -96,18 +97,18 @@ def test_a_scan_without_a_partner_is_left_out_and_noted(tmp_path: Path) -> None:
 def test_lidars_that_never_scan_together_are_refused(tmp_path: Path) -> None:
     path = two_lidars(tmp_path / "two.mcap", later=APART_NS + SECOND // 50)
     with pytest.raises(SourceError, match="/front, /rear"):
-        open_log(path, points_topic="/front,/rear")
+        open_log(path, LogOptions(points_topic="/front,/rear"))
 
 
 def test_a_lidar_that_is_named_twice_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="named twice"):
-        open_log(two_lidars(tmp_path / "two.mcap"), points_topic="/front,/front")
+        open_log(two_lidars(tmp_path / "two.mcap"), LogOptions(points_topic="/front,/front"))
 
 
 @pytest.mark.parametrize("how", [{"beams": 8}, {"deskew": True, "sweep_s": 0.1}])
 def test_what_only_one_lidar_knows_is_refused(how: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match="name one topic"):
-        Reading("two.mcap", "/front,/rear", **how)
+        Reading("two.mcap", LogOptions(points_topic="/front,/rear"), **how)
 
 
 def test_a_vehicle_is_labelled_by_the_cloud_of_its_lidars(tmp_path: Path) -> None:
@@ -118,7 +119,9 @@ def test_a_vehicle_is_labelled_by_the_cloud_of_its_lidars(tmp_path: Path) -> Non
     points = {}
     for topic in ("/front,/rear", "/front"):
         folder = tmp_path / f"of-{len(topic)}"
-        labels = ts.localize(store, drive, str(folder), reading=Reading(drive, topic), **how)
+        labels = ts.localize(
+            store, drive, str(folder), reading=Reading(drive, LogOptions(points_topic=topic)), **how
+        )
         assert set(labels["status"]) == {"done"}
         assert labels["error_mean"].max() < 0.2
         points[topic] = labels["points"].mean()

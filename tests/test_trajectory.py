@@ -16,7 +16,6 @@ from tilestream.formats.logs.degrade import degraded
 from tilestream.formats.logs.deskew import Sweep, deskew
 from tilestream.formats.logs.poses import (
     PoseStatus,
-    compose,
     interpolate,
     inverse,
     jumps,
@@ -126,10 +125,6 @@ def test_chains_of_frames() -> None:
     assert path_between(edges, "camera", "lidar") == [("camera", "base"), ("base", "lidar")]
     assert path_between(edges, "map", "map") == []
     assert path_between(edges, "map", "trailer") is None
-    tree = {edge: Trajectory(np.array([0]), pose(x=1.0 + i)[None]) for i, edge in enumerate(edges)}
-    found = compose(tree, "camera", "lidar", 1.0)
-    assert found is not None
-    np.testing.assert_allclose(found.T_map_lidar[0], pose(x=3.0 - 4.0), atol=1e-12)
 
 
 # --- de-skew

@@ -47,6 +47,7 @@ from tilestream.sensor import HDL64 as HDL64
 from tilestream.sensor import OS1_128 as OS1_128
 from tilestream.sensor import VLP16 as VLP16
 from tilestream.sensor import Sensor as Sensor
+from tilestream.settings import LogOptions as LogOptions
 from tilestream.settings import RegistrationSettings as RegistrationSettings
 from tilestream.settings import StartSettings as StartSettings
 from tilestream.settings import VirtualSettings as VirtualSettings

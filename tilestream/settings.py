@@ -6,15 +6,17 @@ the choice of the model). The options of the command line are made from these fi
 (tests/test_settings.py). The simulated city has a file of its own (`simulation/settings.py`).
 """
 
+import math
+import reprlib
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, model_validator
 
 from tilestream.config import Settings
 from tilestream.errors import UsageError
 from tilestream.records import RouteZ, TruePose
-from tilestream.sensor import SENSORS, Carrier, Sensor, Vehicle, named
+from tilestream.sensor import SENSORS, Carrier, Mount, Sensor, Vehicle, named
 
 Positive = Annotated[float, Field(gt=0.0)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -49,7 +51,76 @@ Bytes = Annotated[int, BeforeValidator(bytes_of), Field(gt=0)]
 """An amount of memory, as a number or as `1.5GB`."""
 
 
-class LogSettings(Settings):
+def _six_numbers(given: object) -> object:
+    """A mount as it is written, `x,y,z,roll,pitch,yaw`, also from a list of the six numbers."""
+    if given is None:
+        return None
+    parts = given.split(",") if isinstance(given, str) else given
+    try:
+        numbers = [float(part) for part in parts] if isinstance(parts, list | tuple) else []
+    except (TypeError, ValueError):
+        numbers = []
+    if len(numbers) != 6 or not all(map(math.isfinite, numbers)):
+        raise ValueError(
+            f"is {reprlib.repr(given)}: give x,y,z,roll,pitch,yaw, in metres and degrees"
+        )
+    return ",".join(repr(number) for number in numbers)
+
+
+class LogOptions(Settings):
+    """How a log is read: which of its topics, and what its frames are."""
+
+    points_topic: str | None = None
+    """Topic of the scans in a log, or those of all lidars of the vehicle, with commas between them:
+    their scans make one each, in the frame of the first; not given: found by what looks like the
+    full turn of a lidar."""
+    pose_topic: str | None = None
+    """Topic of the poses in a log, also one of tf; not given: found by type."""
+    map_frame: str | None = None
+    """Frame of a log that is the map's; not given: `map`, or the one root of its frames that is not
+    an odometry's."""
+    pose_frame: str | None = None
+    """Frame whose poses a log has; not given: as the log says, or as its transforms show."""
+    lidar_frame: str | None = None
+    """Frame of the point clouds, where a log names none or a wrong one."""
+    extrinsic: Annotated[str | None, BeforeValidator(_six_numbers)] = None
+    """Pose of the lidar in the frame that a log poses, as x,y,z,roll,pitch,yaw in metres and
+    degrees (R = Rz Ry Rx, as a mount); not given: by the transforms of the log."""
+    max_gap_s: Positive = 1.0
+    """Longest time between two poses of a log that is interpolated over [s]."""
+    max_speed_mps: Positive = 60.0
+    """Fastest that the vehicle of a log drives [m/s]: over a faster step no pose is interpolated,
+    and a route is cut."""
+
+    @model_validator(mode="after")
+    def _check_lidars(self) -> Self:
+        if "," in (self.points_topic or "") and (self.extrinsic or self.lidar_frame):
+            raise ValueError(
+                f"has several lidars, {self.points_topic}, and extrinsic or lidar_frame, which are "
+                "those of one: leave them out, so that the transforms of the log are taken"
+            )
+        return self
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """What is not the default, by name: what a log's data depend on besides its file."""
+        return self.model_dump(exclude_defaults=True, include=set(LogOptions.model_fields))
+
+    @property
+    def log_options(self) -> "LogOptions":
+        """These options alone, where they are part of more settings."""
+        return LogOptions(**self.given)
+
+    @property
+    def mount(self) -> Mount | None:
+        """The pose of the lidar in the frame that is posed, if it is given (`extrinsic`)."""
+        if self.extrinsic is None:
+            return None
+        numbers = [float(part) for part in self.extrinsic.split(",")]
+        return Mount(**dict(zip(Mount.model_fields, numbers, strict=True)))
+
+
+class LogSettings(LogOptions):
     """Which scans of a log are used. Two choices with the same `every` and another `offset`, or one
     `until_s` and the other `from_s` the same time, share no scan: one maps, one localizes.
     """
@@ -62,11 +133,6 @@ class LogSettings(Settings):
     """Use the scans of a log from this time on [s after its first]."""
     until_s: Positive | None = None
     """Use the scans of a log before this time [s after its first]; not given: to the end."""
-    points_topic: str | None = None
-    """Topic of the scans in a log, or those of all lidars of the vehicle, with commas between them:
-    their scans make one each, in the frame of the first; not given: found by type."""
-    pose_topic: str | None = None
-    """Topic of the poses in a log; not given: found by type."""
 
 
 class IngestSettings(Settings):
@@ -99,7 +165,7 @@ class DriveSettings(LogSettings):
     """A log on which errors are measured, maybe through a degraded sensor."""
 
     log: str
-    """An MCAP log with point clouds and poses."""
+    """A log with point clouds and poses: a file, or the folder of a rosbag2."""
     name: Name | None = None
     """What to call it; not given: the name of its file. Give each drive its own."""
     beams: Annotated[int, Field(ge=1)] | None = None

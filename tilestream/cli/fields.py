@@ -11,9 +11,13 @@ import typer
 from pydantic.fields import FieldInfo
 
 from tilestream.config import Settings
+from tilestream.settings import LogOptions
 
 OLD_FLAGS = {"range_max": "max-range", "blind_rear_deg": "blind-rear", "sweep_s": "sweep"}
 """Flags of version 0.1 that are still taken, by the setting that they are now called after."""
+
+LOGS = "How logs are read"
+"""Heading of the options that all commands have that read logs."""
 
 
 @dataclass(frozen=True)
@@ -77,8 +81,11 @@ def _option(model: type[Settings], name: str, own: dict[str, Any]) -> inspect.Pa
     known = model.model_fields[name]
     needed = known.is_required()
     flags = [f"--{flag}" for flag in (name.replace("_", "-"), OLD_FLAGS.get(name)) if flag]
+    panel = LOGS if name in LogOptions.model_fields else None
     how: Any = (
-        typer.Argument(help=help_of(known)) if needed else typer.Option(*flags, help=help_of(known))
+        typer.Argument(help=help_of(known))
+        if needed
+        else typer.Option(*flags, help=help_of(known), rich_help_panel=panel)
     )
     return inspect.Parameter(
         name,

@@ -17,11 +17,8 @@ from tilestream.errors import PartialError
 from tilestream.formats import describe
 from tilestream.pipeline.jobs import ingest as ingest_map
 from tilestream.pipeline.jobs.run_inputs import ingest_settings, scans_of
-from tilestream.settings import IngestSettings, MapSettings, PlaceSettings
+from tilestream.settings import IngestSettings, LogOptions, LogSettings, MapSettings, PlaceSettings
 from tilestream.store import POINTS, TileStore, open_store
-
-LOG_FIELDS = ("points_topic", "pose_topic", "every", "offset", "from_s", "until_s")
-"""Which scans of a log are used, and where they are in it."""
 
 
 @on_cluster
@@ -31,7 +28,7 @@ def ingest(
         list[str], typer.Argument(help="Files, globs, Autoware map directories, mixed.")
     ],
     store: Annotated[str, typer.Option(help="The tile store: a path or an fsspec URL.")],
-    how: Annotated[MapSettings, fields(*IngestSettings.model_fields, *LOG_FIELDS)],
+    how: Annotated[MapSettings, fields(*IngestSettings.model_fields, *LogSettings.model_fields)],
     limits: Annotated[PlaceSettings, fields("memory")],
     dry_run: DryRun = False,
     cluster: Cluster = HERE,
@@ -39,9 +36,7 @@ def ingest(
     """Make a tile store from point clouds, map directories and logs of drives."""
     settings, scans, allowed = ingest_settings(how), scans_of(how), limits.memory
     if dry_run:
-        plan = ingest_map.plan_ingest(
-            sources, store, settings, allowed, how.points_topic, how.pose_topic, scans
-        )
+        plan = ingest_map.plan_ingest(sources, store, settings, allowed, how.log_options, scans)
         out.print(plan_table(plan))
         return
     failed: PartialError | None = None
@@ -54,8 +49,7 @@ def ingest(
                 client=client,
                 memory=allowed,
                 watch=watch,
-                points_topic=how.points_topic,
-                pose_topic=how.pose_topic,
+                log_options=how.log_options,
                 scans=scans,
             )
         except PartialError as error:
@@ -133,12 +127,14 @@ def _why_left(damage: verifying.Damage) -> str:
     return f"; made from {missing[0]}, which is gone" if missing else ""
 
 
+@with_settings
 def info(
     file: Annotated[str, typer.Argument(help="Any supported file, log or map directory.")],
+    log: Annotated[LogOptions, fields(*LogOptions.model_fields)],
     as_json: AsJson = False,
 ) -> None:
     """Show what is in a file or log: points, bounds, fields, topics, CRS."""
-    found = describe(file)
+    found = describe(file, **log.given)
     if as_json:
         print_json(asdict(found))
     else:

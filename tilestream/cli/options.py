@@ -9,9 +9,10 @@ import typer
 from tilestream.cli.printing import err, say
 from tilestream.errors import PartialError, UsageError
 from tilestream.formats.routes import RoutesRead, read_all_routes, together
+from tilestream.settings import LogOptions
 
 StoreUrl = Annotated[str, typer.Argument(help="The tile store.")]
-Routes = Annotated[list[str], typer.Option(help="TUM, KITTI, CSV, GeoJSON, Lanelet2 or MCAP.")]
+Routes = Annotated[list[str], typer.Option(help="TUM, KITTI, CSV, GeoJSON, Lanelet2 or a log.")]
 Config = Annotated[str, typer.Argument(help="A YAML file, begun with `tilestream template`.")]
 Changes = Annotated[
     list[str], typer.Option("--set", help="key=value over the file, e.g. model.seed=1.")
@@ -36,16 +37,23 @@ def numbers(lists: list[str], option: str) -> list[float]:
 
 @contextmanager
 def routes_of(
-    files: list[str], project_to: str | None, spacing: float, map_crs: str | None
+    files: list[str],
+    project_to: str | None,
+    spacing: float,
+    map_crs: str | None,
+    log_options: LogOptions,
 ) -> Iterator[RoutesRead]:
-    """The routes of all files that can be used; their notes are printed.
+    """The routes of all files that can be used, logs read as these options say; notes are printed.
 
     Raises:
         SourceError, UsageError: none of them can be used; says why the first cannot.
         PartialError: when all is done with the good ones, some cannot be used; lists them, with
             what else failed.
     """
-    read = together(read_all_routes(path, project_to=project_to, map_crs=map_crs) for path in files)
+    read = together(
+        read_all_routes(path, project_to=project_to, map_crs=map_crs, log_options=log_options)
+        for path in files
+    )
     read = read.at_least(spacing)
     for note in read.notes:
         say(note, to=err)

@@ -9,7 +9,6 @@ import typer
 from tilestream.apps import compare as comparing
 from tilestream.cli.cluster import HERE, Cluster, on_cluster
 from tilestream.cli.fields import fields, with_settings
-from tilestream.cli.maps import LOG_FIELDS
 from tilestream.cli.options import AsJson, DryRun, Routes, StoreUrl, numbers, routes_of
 from tilestream.cli.printing import err, out, print_json, say
 from tilestream.cli.progress import progress
@@ -34,6 +33,8 @@ from tilestream.sensor import SENSORS, sensor_of
 from tilestream.settings import (
     DriveSettings,
     LabelSettings,
+    LogOptions,
+    LogSettings,
     MapSettings,
     PlaceSettings,
     RegistrationSettings,
@@ -67,7 +68,10 @@ def localize(
     starts: Annotated[StartSettings, fields("radius", "step")],
     drive: Annotated[
         DriveSettings,
-        fields("log", "beams", "range_max", "blind_rear_deg", "deskew", "sweep_s", *LOG_FIELDS),
+        fields(
+            *("log", "beams", "range_max", "blind_rear_deg", "deskew", "sweep_s"),
+            *LogSettings.model_fields,
+        ),
     ],
     starts_per_task: Annotated[
         int | None, typer.Option(help="Split the starts; default: no.")
@@ -133,6 +137,7 @@ def factors(
             "spacing", "sensor", "sensor_height", "route_z", "cell_size", "project_to", "memory"
         ),
     ],
+    log: Annotated[LogOptions, fields(*LogOptions.model_fields)],
     which: Annotated[Which, typer.Option(help="The paper's 20, their robust twins.")] = "all",
     dry_run: DryRun = False,
     as_json: AsJson = False,
@@ -140,7 +145,7 @@ def factors(
 ) -> None:
     """Compute the factors of the map at every sample point of a route."""
     opened = open_store(store)
-    with routes_of(route, places.project_to, places.spacing, opened.settings.crs) as read:
+    with routes_of(route, places.project_to, places.spacing, opened.settings.crs, log) as read:
         routes = read.routes
         sensor, height, z = places.looking_sensor, places.sensor_height, places.route_z
         if dry_run:
@@ -200,6 +205,7 @@ def compare(
     ],
     labels: Annotated[LabelSettings, fields("matcher")],
     report: Annotated[ReportSettings, fields("threshold")],
+    log: Annotated[LogOptions, fields(*LogOptions.model_fields)],
     sensor: Annotated[
         list[str], typer.Option(help=f"{', '.join(SENSORS)}, or a YAML file; several times.")
     ] = ["VLP16"],  # noqa: B006 - as below: typer's way to name a default
@@ -219,7 +225,7 @@ def compare(
     for limit in (report.threshold, cap):
         check_threshold(limit)
     opened = open_store(store)
-    with routes_of(route, places.project_to, places.spacing, opened.settings.crs) as read:
+    with routes_of(route, places.project_to, places.spacing, opened.settings.crs, log) as read:
         routes = read.routes
         choices = comparing.choices_of(
             [sensor_of(name) for name in sensor],

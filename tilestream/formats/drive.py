@@ -1,7 +1,6 @@
 """A drive as map points: the scans of a log, each moved into the map by its pose."""
 
 from collections.abc import Iterator
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,6 @@ import numpy as np
 from tilestream.errors import PoseError, UsageError
 from tilestream.formats.base import Block, PointSource, SourceInfo, Span
 from tilestream.formats.logs import LOG_FORMATS, open_log
-from tilestream.formats.logs.base import LogOptions
 from tilestream.formats.logs.drivers import returned
 from tilestream.formats.logs.poses import transform
 from tilestream.formats.logs.scan_log import ScanLog, kept
@@ -18,6 +16,7 @@ from tilestream.formats.logs.selection import ScanSelection
 from tilestream.formats.points.rows import steps, whole_span
 from tilestream.formats.registry import Format
 from tilestream.records import Float64
+from tilestream.settings import LogOptions
 
 
 class DriveSource:
@@ -89,16 +88,16 @@ def open_drive(
         path: a log of any format.
         scans: which scans become the map; default: all.
         range_max: points farther than this from the lidar are left out [m]; default: none.
-        options: topics and frames, as for `open_log`.
+        options: fields of `LogOptions`: topics and frames, as for `open_log`.
 
     Raises:
-        UsageError: `range_max` is not positive.
+        UsageError: `range_max` is not positive, or no such option.
         SourceError: as `open_log`.
         PoseError: as `open_log`, and if no scan of the selection has a pose.
     """
     if range_max is not None and not range_max > 0:
         raise UsageError(f"range_max = {range_max}: must be a positive length in metres")
-    log = open_log(path, **options)
+    log = open_log(path, LogOptions(**options))
     scans = scans or ScanSelection()
     if not log.posed[scans.indices(log.stamps_ns)].any():
         raise PoseError(f"{path}: none of its {len(log)} scans that {scans} selects has a pose")
@@ -114,7 +113,7 @@ DRIVES: tuple[Format[PointSource], ...] = tuple(
         magic=log.magic,
         recognise=log.recognise,
         marker=log.marker,
-        options=(*(option.name for option in fields(LogOptions)), "scans", "range_max"),
+        options=(*LogOptions.model_fields, "scans", "range_max"),
     )
     for log in LOG_FORMATS
 )

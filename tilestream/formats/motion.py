@@ -7,13 +7,14 @@ from numpy.typing import NDArray
 
 from tilestream.kernels.fixed_order import norms
 from tilestream.records import Float64
+from tilestream.settings import LogOptions
 
 MOVED_M = 0.5
 """A vehicle has moved once it is so far from where it was [m]: more than poses shake by."""
 REPEATED_M = 0.01
 """A point closer than this to another repeats it [m]."""
-FASTEST = 60.0
-"""No vehicle drives faster [m/s]."""
+FASTEST = LogOptions().max_speed_mps
+"""No vehicle drives faster, unless one is told to [m/s]."""
 
 
 def vertices(points: Float64) -> list[int]:
@@ -46,9 +47,10 @@ def along(points: Float64) -> Float64:
     return np.maximum.accumulate(reached)
 
 
-def jumped(steps: Float64, seconds: Float64) -> NDArray[np.bool_]:
+def jumped(steps: Float64, seconds: Float64, max_speed_mps: float = FASTEST) -> NDArray[np.bool_]:
     """Which steps [m] no vehicle drives in such a time [s]; no less than `MOVED_M`, since poses
     also shake, and none where time stands still.
     """
-    result: NDArray[np.bool_] = (steps > MOVED_M) & (seconds > 0) & (steps > FASTEST * seconds)
+    faster = steps > max_speed_mps * seconds
+    result: NDArray[np.bool_] = (steps > MOVED_M) & (seconds > 0) & faster
     return result

@@ -15,6 +15,8 @@ from tilestream.errors import (
 
 Opened_co = TypeVar("Opened_co", covariant=True)
 
+_PACKED = {".zstd": "zstd -d", ".zst": "zstd -d", ".gz": "gunzip", ".bz2": "bunzip2"}
+"""Endings of compressed files, and what unpacks them."""
 _HEAD = 4096
 """What is read of a file to see which format it has [bytes]."""
 
@@ -110,6 +112,8 @@ def _unknown_ending(
     path: str, content: Format[Opened_co] | None, formats: Sequence[Format[Opened_co]]
 ) -> str:
     ending = Path(path).suffix.lower()
+    if ending in _PACKED:
+        return f"it is compressed: unpack it first ({_PACKED[ending]})"
     what = f"the ending {ending!r} is of no supported format" if ending else "it has no ending"
     if content is not None:
         return f"{what}; its content looks like {content.name}, rename it to {content.endings[0]}"

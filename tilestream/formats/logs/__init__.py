@@ -1,10 +1,11 @@
 """Logs of drives, whatever their format: one protocol (base.py) and the registry below."""
 
 from functools import lru_cache
+from glob import glob, has_magic
 from pathlib import Path
 
-from tilestream.formats.logs import mcap
-from tilestream.formats.logs.base import MAX_GAP_S, LogOptions, Recording
+from tilestream.formats.logs import mcap, ros_bags, rosbag2
+from tilestream.formats.logs.base import Recording
 from tilestream.formats.logs.mcap_write import write_log
 from tilestream.formats.logs.scan_log import ScanLog, with_poses
 from tilestream.formats.logs.selection import ScanSelection
@@ -16,10 +17,16 @@ from tilestream.formats.registry import (
     format_of_ending,
     state_of,
 )
+from tilestream.settings import LogOptions
 
 __all__ = ["LOG_FORMATS", "ScanLog", "ScanSelection", "is_log", "open_log", "write_log"]
 
-LOG_FORMATS: tuple[Format[Recording], ...] = (mcap.FORMAT,)
+LOG_FORMATS: tuple[Format[Recording], ...] = (
+    mcap.FORMAT,
+    rosbag2.FORMAT,
+    ros_bags.DB3,
+    ros_bags.BAG,
+)
 """What `open_log` reads. `formats.FORMATS` has each of them too, as a drive that becomes a map."""
 
 
@@ -27,33 +34,23 @@ def is_log(path: str) -> bool:
     """Whether a path, or a glob of paths, is that of a log: by its ending, or a directory's marker;
     the content is not read.
     """
-    named = format_of_ending(path, LOG_FORMATS) or format_of_directory(path, LOG_FORMATS)
-    return named is not None
+    matches = glob(path, recursive=True) if has_magic(path) else ()  # noqa: PTH207
+    return any(
+        format_of_ending(match, LOG_FORMATS) or format_of_directory(match, LOG_FORMATS)
+        for match in (path, *matches)
+    )
 
 
-def open_log(
-    path: str | Path,
-    *,
-    points_topic: str | None = None,
-    pose_topic: str | None = None,
-    map_frame: str | None = None,
-    pose_frame: str | None = None,
-    max_gap_s: float = MAX_GAP_S,
-) -> ScanLog:
+def open_log(path: str | Path, options: LogOptions | None = None) -> ScanLog:
     """Open a log of scans and poses: its scans with the pose of the lidar at each.
 
     The log is read through once; in one process a log that has not changed is not read again.
 
     Args:
         path: a file or directory of one of `LOG_FORMATS`.
-        points_topic: topic of the scans; default: the one with the most messages. Several, with
-            commas between them, are the lidars of one vehicle, and their scans make one each
-            (`together`).
-        pose_topic: topic of the poses; default: see the format, e.g. `mcap.open_mcap`.
-        map_frame: frame that counts as the map; default `map`; with tf, where there is no such
-            frame, the root of the tree above the lidar.
-        pose_frame: frame whose poses these are, where the log does not name it.
-        max_gap_s: longest time between two poses that is interpolated over [s].
+        options: topics and frames; None: found, see `recording.record`. Several
+            topics of scans, with commas between them, are the lidars of one vehicle, and their
+            scans make one each (`together`).
 
     Raises:
         SourceNotFoundError: no such file.
@@ -62,12 +59,12 @@ def open_log(
         SourceError: no scans, or several topics that are equally good; names what is there.
         PoseError: no poses, none at the time of any scan, or several topics that are equally good.
     """
-    name = str(path)
-    topics = [None] if points_topic is None else [part.strip() for part in points_topic.split(",")]
+    name, options = str(path), options or LogOptions()
+    topics = [part.strip() or None for part in (options.points_topic or "").split(",")]
     found, state = format_of(name, LOG_FORMATS), state_of(name)
     logs = [
-        _opened(name, found, state, LogOptions(t, pose_topic, map_frame, pose_frame, max_gap_s))
-        for t in topics
+        _opened(name, found, state, options.model_copy(update={"points_topic": topic}))
+        for topic in topics
     ]
     return logs[0] if len(logs) == 1 else together(logs)
 
@@ -79,4 +76,4 @@ def _opened(
     state: tuple[int, int],  # noqa: ARG001  a changed log is another
     options: LogOptions,
 ) -> ScanLog:
-    return with_poses(found.opened(path, options), options.max_gap_s)
+    return with_poses(found.opened(path, options), options)

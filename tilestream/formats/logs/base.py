@@ -13,24 +13,8 @@ from numpy.typing import NDArray
 
 from tilestream.records import Float64, Int64, Trajectory
 
-MAX_GAP_S = 1.0
-"""Longest time between two poses that is interpolated over [s]."""
-
-
-@dataclass(frozen=True)
-class LogOptions:
-    """Which scans and poses of a log are taken. A format without topics or frames ignores them."""
-
-    points_topic: str | None = None
-    """Topic of the scans; None: the one with the most."""
-    pose_topic: str | None = None
-    """Topic of the poses; None: the format's own rule, see its opening function."""
-    map_frame: str | None = None
-    """Frame that counts as the map; None: `map`, or the root of the tree of frames."""
-    pose_frame: str | None = None
-    """Frame whose poses these are, where a log does not name it; None: the lidar's."""
-    max_gap_s: float = MAX_GAP_S
-    """Longest time between two poses that is interpolated over [s]."""
+METADATA = "metadata.yaml"
+"""What every rosbag2 folder has beside its files."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,6 +6,7 @@ import numpy as np
 
 from tilestream.errors import PoseError, UsageError
 from tilestream.formats.logs.poses import PoseStatus, interpolate
+from tilestream.formats.motion import FASTEST
 from tilestream.kernels.fixed_order import turned
 from tilestream.records import Float64, Scan, Trajectory
 
@@ -31,7 +32,12 @@ class Sweep:
 
 
 def deskew(
-    scan: Scan, poses: Trajectory, *, sweep: Sweep | None = None, max_gap_s: float = 1.0
+    scan: Scan,
+    poses: Trajectory,
+    *,
+    sweep: Sweep | None = None,
+    max_gap_s: float = 1.0,
+    max_speed_mps: float = FASTEST,
 ) -> Scan:
     """The scan as if all its points had been taken at its stamp.
 
@@ -43,6 +49,7 @@ def deskew(
         poses: of the lidar, around the scan.
         sweep: how the lidar turns; used only where the scan has no times.
         max_gap_s: longest time between two poses to interpolate over [s].
+        max_speed_mps: fastest that the vehicle drives [m/s].
 
     Returns:
         The scan with moved points and all time offsets 0.
@@ -64,7 +71,7 @@ def deskew(
     assert offsets is not None
     offsets_ns = np.round(offsets * 1e9).astype(np.int64)
     times, which = np.unique(np.append(offsets_ns, 0), return_inverse=True)
-    T, status = interpolate(poses, scan.stamp_ns + times, max_gap_s)
+    T, status = interpolate(poses, scan.stamp_ns + times, max_gap_s, max_speed_mps)
     if not (status == PoseStatus.POSED).all():
         lacking = times[status != PoseStatus.POSED] / 1e9
         raise PoseError(

@@ -18,6 +18,8 @@ TIME_FIELDS = ("time", "t", "timestamp", "offset_time", "time_stamp")
 TURN_S = (0.005, 2.0)
 """How long a turn of a lidar takes, at least and at most [s]: less apart than two units of time, so
 that the span of a turn fits in one of them."""
+FULL_TURN_DEG = 300.0
+"""A scan that spans less is of a lidar that looks one way, or a part of a turn [deg]."""
 TICKS = (1, 10**3, 10**6, 10**9)
 """How many of a unit are a second: the units in which drivers write times of points."""
 
@@ -54,6 +56,15 @@ def returned(points: Float64) -> NDArray[np.bool_]:
     maybe_origin = np.flatnonzero(sums == 0.0)
     keep[maybe_origin] = points[maybe_origin].any(axis=1)
     return keep
+
+
+def span_deg(points: Float64) -> float:
+    """How far round (n, 3) returns lie [deg]: all but the largest gap between two azimuths."""
+    if len(points) < 2:
+        return 0.0
+    azimuth = np.sort(np.degrees(np.arctan2(points[:, 1], points[:, 0])))
+    gap = max(float(np.diff(azimuth).max()), 360.0 - float(azimuth[-1] - azimuth[0]))
+    return 360.0 - gap
 
 
 def ticks_of(span: float) -> int | None:

@@ -9,9 +9,8 @@ import io
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from pathlib import Path
 
 from mcap.data_stream import ReadDataStream
@@ -21,6 +20,7 @@ from mcap.summary import Summary
 
 from tilestream.errors import CorruptSourceError, foreign_errors
 from tilestream.formats.logs.mcap_chunk import LARGEST_RECORD, unpack_chunk
+from tilestream.formats.logs.messages import Message, Topic
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = struct.Struct("<BQ")
@@ -32,41 +32,11 @@ _READ = (Opcode.CHUNK, Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.DAT
 """Records that are read; all others are passed over."""
 
 
-@dataclass(frozen=True)
-class Topic:
-    """A topic of a log."""
-
-    name: str
-    """As recorded, e.g. `/points`."""
-    type: str
-    """Message type without the `msg` part, e.g. `sensor_msgs/PointCloud2`."""
-    encoding: str
-    """Encoding of its messages, e.g. `cdr`."""
-    messages: int
-    """Messages that the file holds."""
-
-
-@dataclass(frozen=True, eq=False)
-class Message:
-    """A message as it lies in the file."""
-
-    topic: str
-    """Name of its topic."""
-    record: int
-    """Offset in the file of the chunk, or of the message outside of chunks, that holds it."""
-    start: int
-    """Offset of its content in the unpacked record."""
-    unpacked: int
-    """Size of the unpacked record [bytes]."""
-    data: memoryview
-    """Its content."""
-
-
 class McapFile(AbstractContextManager["McapFile"]):
-    """An MCAP file that is open for reading.
+    """An MCAP file that is open for reading: a `MessageFile`.
 
-    Once messages were read, `lost` says what a cut file lacks (None: nothing), and `unchecked`
-    whether some of them lay in records without a CRC, where damage cannot be seen.
+    The place of a message is the offset in the file of the chunk that holds it (or of the message
+    itself, outside of chunks), and start and size in the unpacked chunk.
 
     Args:
         path: the file, which begins with `MAGIC`.
@@ -88,6 +58,7 @@ class McapFile(AbstractContextManager["McapFile"]):
             self.unchecked = False
             self._channels: dict[int, tuple[str, str, str]] = {}
             self._schemas: dict[int, str] = {}
+            self._last: tuple[int, bytes] = (-1, b"")
             self._learnt: dict[tuple[int, bytes], bytes] = {}
             self._summary = self._read_summary() if self.whole and topics else None
             self.topics = self._count_topics() if topics else ()
@@ -117,7 +88,19 @@ class McapFile(AbstractContextManager["McapFile"]):
                 if topic in wanted:
                     start += MESSAGE_HEAD.size
                     data = memoryview(content)[start:stop]
-                    yield Message(topic, record, start, len(content), data)
+                    held = 2 * len(content)  # a chunk, packed and unpacked
+                    yield Message(topic, (record, start, stop - start), held, data)
+
+    def content(self, topic: str, place: Sequence[int]) -> memoryview:  # noqa: ARG002
+        """The message at a place; messages of one chunk, one after the other, unpack it once."""
+        record, start, size = place
+        if self._last[0] != record:
+            self._last = (record, self.unpack(record))
+        return memoryview(self._last[1])[start : start + size]
+
+    def where(self, place: Sequence[int]) -> str:
+        """A place in words."""
+        return f"record at byte {place[0]}"
 
     def unpack(self, record: int) -> bytes:
         """The records inside the chunk at an offset of the file, or the record itself where a

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from tilestream.formats.motion import jumped
+from tilestream.formats.motion import FASTEST, jumped
 from tilestream.kernels.fixed_order import norms, turned
 from tilestream.records import Float64, Int64, Trajectory
 
@@ -71,7 +71,7 @@ def trajectory(stamps_ns: Int64, numbers: Float64, frame: str) -> tuple[Trajecto
 
 
 def interpolate(
-    poses: Trajectory, stamps_ns: Int64, max_gap_s: float
+    poses: Trajectory, stamps_ns: Int64, max_gap_s: float, max_speed_mps: float = FASTEST
 ) -> tuple[Float64, NDArray[np.int8]]:
     """The pose at some times: position linear, rotation at constant rate between two poses (slerp),
     the recorded pose itself where the times agree, never beyond the first or last pose, and never
@@ -81,6 +81,7 @@ def interpolate(
         poses: k >= 0 poses.
         stamps_ns: (m,) times [ns].
         max_gap_s: longest time between two poses to interpolate over [s].
+        max_speed_mps: fastest that the vehicle drives [m/s].
 
     Returns:
         (m, 4, 4) poses, NaN where there is none; (m,) `PoseStatus`.
@@ -103,15 +104,15 @@ def interpolate(
     gaps = np.flatnonzero(between)[span > max_gap_s * 1e9]
     T[gaps], status[gaps] = np.nan, PoseStatus.GAP
     steps = norms(poses.T_map_lidar[b, :3, 3] - poses.T_map_lidar[b - 1, :3, 3])
-    over = np.flatnonzero(between)[jumped(steps, span / 1e9)]
+    over = np.flatnonzero(between)[jumped(steps, span / 1e9, max_speed_mps)]
     T[over], status[over] = np.nan, PoseStatus.JUMP
     return T, status
 
 
-def jumps(poses: Trajectory) -> NDArray[np.bool_]:
+def jumps(poses: Trajectory, max_speed_mps: float = FASTEST) -> NDArray[np.bool_]:
     """(k - 1,) whether no vehicle drives from each pose to the next in the time between them."""
     steps = norms(np.diff(poses.T_map_lidar[:, :3, 3], axis=0))
-    return jumped(steps, np.diff(poses.stamps_ns) / 1e9)
+    return jumped(steps, np.diff(poses.stamps_ns) / 1e9, max_speed_mps)
 
 
 def _blend(T_a: Float64, T_b: Float64, share: Float64) -> Float64:
@@ -152,35 +153,3 @@ def path_between(edges: Iterable[Edge], source: str, target: str) -> list[Edge] 
         chain.append(came_from[chain[-1]])
     chain.reverse()
     return list(pairwise(chain))
-
-
-def compose(
-    edges: dict[Edge, Trajectory], source: str, target: str, max_gap_s: float
-) -> Trajectory | None:
-    """The poses of `target` in `source` along a tree of frames.
-
-    An edge with a single pose holds at all times. The result has a pose at every time of every
-    edge that moves, as far as all of them have one there (interpolated, no gap).
-
-    Returns:
-        The trajectory, of frame `target`; without poses where the edges never overlap in time;
-        None where the tree does not connect the frames.
-    """
-    chain = path_between(edges, source, target)
-    if chain is None:
-        return None
-    along = [(edges.get((a, b)), edges.get((b, a))) for a, b in chain]
-    moving = [e for forth, back in along if (e := forth or back) and len(e.stamps_ns) > 1]
-    stamps = np.unique(np.concatenate([e.stamps_ns for e in moving] or [np.zeros(1, np.int64)]))
-    T = np.tile(np.eye(4), (len(stamps), 1, 1))
-    for forth, back in along:
-        T = T @ (_at(forth, stamps, max_gap_s) if forth else inverse(_at(back, stamps, max_gap_s)))
-    posed = np.isfinite(T).all(axis=(1, 2))
-    return Trajectory(stamps[posed], T[posed], target)
-
-
-def _at(edge: Trajectory | None, stamps_ns: Int64, max_gap_s: float) -> Float64:
-    assert edge is not None
-    if len(edge.stamps_ns) == 1:
-        return np.broadcast_to(edge.T_map_lidar, (len(stamps_ns), 4, 4))
-    return interpolate(edge, stamps_ns, max_gap_s)[0]

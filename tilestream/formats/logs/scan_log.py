@@ -15,15 +15,24 @@ from tilestream.errors import (
 )
 from tilestream.formats.base import SourceInfo
 from tilestream.formats.logs.base import RecordedScan, Recording
-from tilestream.formats.logs.drivers import TIME_FIELDS, TURN_S, returned, ticks_of, time_offsets
+from tilestream.formats.logs.drivers import (
+    FULL_TURN_DEG,
+    TIME_FIELDS,
+    TURN_S,
+    returned,
+    span_deg,
+    ticks_of,
+    time_offsets,
+)
 from tilestream.formats.logs.poses import PoseStatus, interpolate, jumps
-from tilestream.formats.motion import FASTEST, along
+from tilestream.formats.motion import along
 from tilestream.records import Float64, Int64, Scan
+from tilestream.settings import LogOptions
 
 _BYTES_PER_POINT = 80
 """What the columns of a scan that is read take [bytes per point]."""
 LOOKED_AT = 5
-"""So many scans tell the unit of the points' times."""
+"""So many scans tell how much of a turn they span, and the unit of the points' times."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -106,27 +115,38 @@ class ScanLog(Recording):
         )
 
 
-def with_poses(found: Recording, max_gap_s: float) -> ScanLog:
-    """The scans of a log with their poses, interpolated over at most `max_gap_s` [s], and the unit
-    of the points' times. Scans without a pose are noted, so are jumps, and times of no use.
+def with_poses(found: Recording, options: LogOptions) -> ScanLog:
+    """The scans of a log with their poses, interpolated as the options allow, and the unit of the
+    points' times. Scans without a pose are noted, so are jumps, and times of no use.
 
     Raises:
         PoseError: no scan has a pose.
     """
-    T_map_lidar, status = interpolate(found.trajectory, found.stamps_ns, max_gap_s)
-    notes = (*found.notes, *_skipped(found, status, max_gap_s), *_jumps(found))
+    T_map_lidar, status = interpolate(
+        found.trajectory, found.stamps_ns, options.max_gap_s, options.max_speed_mps
+    )
+    notes = (*found.notes, *_skipped(found, status, options), *_jumps(found, options))
     known = {**vars(found), "notes": notes}
-    return _with_times(ScanLog(**known, T_map_lidar=T_map_lidar, pose_status=status))
+    return _looked_at(ScanLog(**known, T_map_lidar=T_map_lidar, pose_status=status))
 
 
-def _with_times(log: ScanLog) -> ScanLog:
+def _looked_at(log: ScanLog) -> ScanLog:
+    """With what a few scans tell: how far round they look, and the unit of the points' times."""
+    few = np.unique(np.linspace(0, len(log) - 1, LOOKED_AT).round().astype(int))
+    scans = list(log.recorded_at(few.tolist()))
+    turn = float(np.median([span_deg(scan.points[returned(scan.points)]) for scan in scans]))
+    if turn < FULL_TURN_DEG:
+        log = replace(log, notes=(*log.notes, f"scans span {turn:.0f} degrees, not a full turn"))
+    return _with_times(log, scans)
+
+
+def _with_times(log: ScanLog, scans: list[RecordedScan]) -> ScanLog:
     """With the unit of the points' times: the one in which the middle of the spans of a few scans
     is a turn of a lidar.
     """
     if not any(name in TIME_FIELDS for name, _ in log.fields):
         return log
-    few = np.unique(np.linspace(0, len(log) - 1, LOOKED_AT).round().astype(int))
-    spans = [_span(recorded) for recorded in log.recorded_at(few.tolist())]
+    spans = [_span(recorded) for recorded in scans]
     span = float(np.median([span for span in spans if span > 0] or [0.0]))
     ticks = ticks_of(span)
     if ticks is None and span > 0:
@@ -147,33 +167,34 @@ def _span(recorded: RecordedScan) -> float:
     return float(np.ptp(times)) if len(times) else 0.0
 
 
-def _jumps(found: Recording) -> list[str]:
+def _jumps(found: Recording, options: LogOptions) -> list[str]:
     """A note on poses that jump."""
-    at = np.flatnonzero(jumps(found.trajectory))
+    at = np.flatnonzero(jumps(found.trajectory, options.max_speed_mps))
     if not len(at):
         return []
     a, b = found.trajectory.T_map_lidar[[at[0], at[0] + 1], :3, 3]
     seconds = found.trajectory.stamps_ns[at[0]] / 1e9
     first = f"first by {math.dist(a, b):.1f} m after {seconds:.3f} s"
     steps = len(found.trajectory.stamps_ns) - 1
-    return [f"poses jump faster than {FASTEST:g} m/s at {len(at)} of {steps} steps, {first}"]
+    fastest = f"{options.max_speed_mps:g} m/s"
+    return [f"poses jump faster than {fastest} at {len(at)} of {steps} steps, {first}"]
 
 
-def _skipped(found: Recording, status: NDArray[np.int8], max_gap_s: float) -> list[str]:
+def _skipped(found: Recording, status: NDArray[np.int8], options: LogOptions) -> list[str]:
     """A note for each reason for which scans have no pose."""
     reasons = {
         PoseStatus.BEFORE: "before the first pose",
         PoseStatus.AFTER: "after the last pose",
-        PoseStatus.GAP: f"where poses are more than {max_gap_s:g} s apart",
-        PoseStatus.JUMP: f"where poses jump faster than {FASTEST:g} m/s",
+        PoseStatus.GAP: f"where poses are more than {options.max_gap_s:g} s apart",
+        PoseStatus.JUMP: f"where poses jump faster than {options.max_speed_mps:g} m/s",
     }
     if not (status == PoseStatus.POSED).any():
         scans, poses = found.stamps_ns / 1e9, found.trajectory.stamps_ns / 1e9
         raise PoseError(
             f"{found.path}: none of the {len(scans)} scans has a pose: scans are from "
             f"{scans[0]:.3f} to {scans[-1]:.3f} s, poses from {poses[0]:.3f} to {poses[-1]:.3f} s, "
-            f"and none is interpolated over more than {max_gap_s:g} s or a jump faster than "
-            f"{FASTEST:g} m/s; are these the same clock?"
+            f"and none is interpolated over more than {options.max_gap_s:g} s or a jump faster "
+            f"than {options.max_speed_mps:g} m/s; are these the same clock?"
         )
     counts = {why: int((status == code).sum()) for code, why in reasons.items()}
     return [f"{n} of {len(status)} scans skipped: {why}" for why, n in counts.items() if n]

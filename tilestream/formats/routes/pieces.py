@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tilestream.formats.motion import MOVED_M, along, jumped, vertices
+from tilestream.formats.motion import FASTEST, MOVED_M, along, jumped, vertices
 from tilestream.formats.routes.base import Path3
 from tilestream.kernels.fixed_order import norms
 
@@ -14,7 +14,7 @@ PAUSE = 5.0
 """... if it also took so many times as long: without a pause it is the vehicle that is faster."""
 
 
-def pieces(path: Path3) -> tuple[list[Path3], list[str]]:
+def pieces(path: Path3, max_speed_mps: float = FASTEST) -> tuple[list[Path3], list[str]]:
     """The parts of a recorded path between its gaps, and notes on where it was cut.
 
     A gap is a step that no vehicle drives between its stamps (`motion.jumped`), or that is more
@@ -24,6 +24,7 @@ def pieces(path: Path3) -> tuple[list[Path3], list[str]]:
 
     Args:
         path: a path in metres.
+        max_speed_mps: fastest that a vehicle drives [m/s].
     """
     xyz = path.positions
     known = xyz[:, :2] if np.isnan(xyz[:, 2]).all() else xyz
@@ -35,7 +36,7 @@ def pieces(path: Path3) -> tuple[list[Path3], list[str]]:
     if path.stamps_s is not None:
         seconds = np.diff(path.stamps_s)
         gaps &= seconds > PAUSE * np.median(seconds)
-        gaps |= jumped(steps, seconds)
+        gaps |= jumped(steps, seconds, max_speed_mps)
     cuts = np.flatnonzero(gaps) + 1
     if not len(cuts):
         return [path], []

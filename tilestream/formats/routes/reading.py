@@ -24,6 +24,7 @@ from tilestream.formats.routes.lanelet2 import read_lanelet2
 from tilestream.formats.routes.pieces import pieces
 from tilestream.formats.routes.routes_read import RoutesRead, named
 from tilestream.records import Route
+from tilestream.settings import LogOptions
 
 READERS: dict[str, Callable[[str], Sequence[Path3 | Lost]]] = {
     ".tum": read_poses,
@@ -44,8 +45,7 @@ def read_all_routes(
     map_crs: str | None = None,
     max_jump: float = 1000.0,
     z_offset: float = 0.0,
-    pose_topic: str | None = None,
-    points_topic: str | None = None,
+    log_options: LogOptions | None = None,
 ) -> RoutesRead:
     """The routes in a file that can be used, and which cannot and why. Formats, known by the
     ending:
@@ -57,7 +57,8 @@ def read_all_routes(
     * `.geojson`, `.json`: every LineString; of a MultiLineString each part;
     * `.osm`: Lanelet2; centre lines of the lanelets for vehicles, joined as long as one follows the
       other without a fork; in `local_x`, `local_y` where every node has them, else degrees;
-    * a log (`.mcap`): its poses, those of the lidar, see `logs.open_log`.
+    * a log (a file, or the folder of a rosbag2): its poses, those of the lidar, see
+      `logs.open_log`.
 
     A route leads through vertices 0.5 m apart or farther (`motion.vertices`), so that a vehicle
     that stands while its poses shake goes nowhere; other points are dropped and counted. A path
@@ -76,8 +77,8 @@ def read_all_routes(
         map_crs: CRS of the map that the routes are for; what names none is in it.
         max_jump: longest distance between successive points [m].
         z_offset: added to z, as where heights of the file and of the map are of two systems [m].
-        pose_topic: topic of the poses of a log.
-        points_topic: topic of the scans of a log, of whose lidar its poses are.
+        log_options: topics and frames of a log, and how fast any recorded vehicle drives; None:
+            found, and the default.
 
     Returns:
         The routes, those that are lost, and notes. A file that cannot be read at all is lost as a
@@ -90,9 +91,10 @@ def read_all_routes(
             cannot be used, or that is not the map's and cannot be brought there.
     """
     name = str(path)
+    options = log_options or LogOptions()
     try:
         with foreign_errors(CorruptSourceError, f"{name}: cannot be read as routes"):
-            drawn = _drawn(name, pose_topic, points_topic)
+            drawn = _drawn(name, options)
             paths = [part for part in drawn if isinstance(part, Path3)]
             crs = crs or next((part.crs for part in paths), None)
             by_hand = not any(part.recorded for part in paths)
@@ -110,7 +112,8 @@ def read_all_routes(
     found: list[Route] = []
     notes: list[str] = list(of_crs)
     for drawn_path, xyz in zip(paths, points, strict=True):
-        parts, told = pieces(replace(drawn_path, positions=xyz + np.array([0.0, 0.0, z_offset])))
+        lifted = replace(drawn_path, positions=xyz + np.array([0.0, 0.0, z_offset]))
+        parts, told = pieces(lifted, options.max_speed_mps)
         notes += told
         for part in parts:
             where = f"{name}: route {part.route_id}"
@@ -139,8 +142,7 @@ def read_routes(
     map_crs: str | None = None,
     max_jump: float = 1000.0,
     z_offset: float = 0.0,
-    pose_topic: str | None = None,
-    points_topic: str | None = None,
+    log_options: LogOptions | None = None,
 ) -> list[Route]:
     """All routes in a file; arguments as for `read_all_routes`, which goes on where this refuses.
 
@@ -159,8 +161,7 @@ def read_routes(
         map_crs=map_crs,
         max_jump=max_jump,
         z_offset=z_offset,
-        pose_topic=pose_topic,
-        points_topic=points_topic,
+        log_options=log_options,
     )
     for lost in read.lost:
         raise lost.error
@@ -176,7 +177,7 @@ def read_route(
     map_crs: str | None = None,
     max_jump: float = 1000.0,
     z_offset: float = 0.0,
-    pose_topic: str | None = None,
+    log_options: LogOptions | None = None,
 ) -> Route:
     """The one route of a file, or the one with this id; otherwise as `read_routes`.
 
@@ -190,7 +191,7 @@ def read_route(
         map_crs=map_crs,
         max_jump=max_jump,
         z_offset=z_offset,
-        pose_topic=pose_topic,
+        log_options=log_options,
     )
     routes = read.routes
     chosen = [r for r in routes if route_id in (None, r.route_id)]
@@ -203,11 +204,11 @@ def read_route(
     return chosen[0]
 
 
-def _drawn(path: str, pose_topic: str | None, points_topic: str | None) -> Sequence[Path3 | Lost]:
+def _drawn(path: str, options: LogOptions) -> Sequence[Path3 | Lost]:
     """The paths that a file draws, in its own coordinates; at least one, or one that is lost."""
     ending = Path(path).suffix.lower()
     if is_log(path):
-        poses = open_log(path, points_topic=points_topic, pose_topic=pose_topic).trajectory
+        poses = open_log(path, options).trajectory
         return [
             Path3(
                 Path(path).stem,

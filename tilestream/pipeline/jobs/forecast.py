@@ -92,16 +92,16 @@ def _expected_map(
         settings.store_url,
         ingest_settings(settings.map),
         settings.memory,
-        settings.map.points_topic,
-        settings.map.pose_topic,
+        settings.map.log_options,
         map_scans(settings, inputs),
     )
     store = TileStore(settings.store_url, store_settings(ingest_settings(settings.map)))
     have: dict[TileKey, TilePoints] = {}
     unknown: list[str] = []
     spans = [task.reads["blocks"] for task in plan.tasks]
-    for path in sorted({span.path for span in spans if isinstance(span, SourceSpan)}):
-        bounds = describe(path).bounds
+    opened_with = {span.path: span.options for span in spans if isinstance(span, SourceSpan)}
+    for path, options in sorted(opened_with.items()):
+        bounds = describe(path, **dict(options)).bounds
         if bounds is None:
             unknown.append(path)
         else:

@@ -24,7 +24,6 @@ from tilestream.pipeline.jobs.sources import (
     Source,
     as_read,
     examine_all,
-    log_options,
     with_crs,
     within,
 )
@@ -37,7 +36,7 @@ from tilestream.pipeline.stages.scatter import (
     scatter,
     scatter_tasks,
 )
-from tilestream.settings import IngestSettings
+from tilestream.settings import IngestSettings, LogOptions
 from tilestream.store import Manifest, StoreSettings, TileStore, open_store
 
 MADE_BY = {stage.name: stage.version for stage in (scatter, merge)}
@@ -56,8 +55,7 @@ def ingest(
     client: Any | None = None,
     memory: int = DEFAULT_MEMORY,
     watch: Watch | None = None,
-    points_topic: str | None = None,
-    pose_topic: str | None = None,
+    log_options: LogOptions | None = None,
     scans: ScanSelection | None = None,
 ) -> TileStore:
     """Make a tile store from point clouds, map directories and logs of drives.
@@ -67,7 +65,7 @@ def ingest(
     a changed source redoes the tiles that it touches; unchanged tiles are kept.
 
     Args:
-        sources: files, globs and Autoware map directories, mixed: PCD, LAS, LAZ, PLY, E57, MCAP.
+        sources: files, globs and Autoware map directories, mixed: PCD, LAS, LAZ, PLY, E57, logs.
             They are the whole map: a source that the store knows must be given again.
         url: the store, a local path or any fsspec URL.
         tile_size: edge of a tile [m].
@@ -78,9 +76,8 @@ def ingest(
         client: a Dask client to run on; None: this process.
         memory: what a task may use [bytes].
         watch: is told of each task that ended.
-        points_topic: topic of the scans in MCAP logs; None: found by type.
-        pose_topic: topic of the poses in MCAP logs; None: found by type.
-        scans: which scans of MCAP logs become the map; None: all.
+        log_options: topics and frames of the logs among the sources; None: found.
+        scans: which scans of logs become the map; None: all.
 
     Returns:
         The store, with every tile that holds a point.
@@ -98,7 +95,7 @@ def ingest(
         tile_size=tile_size, halo=halo, map_leaf=map_leaf, crs=crs, keep_noise=keep_noise
     )
     with only_writer(url):
-        reading = read_sources(sources, url, settings, memory, points_topic, pose_topic, scans)
+        reading = read_sources(sources, url, settings, memory, log_options, scans)
         outcomes = execute(reading.first(), client, watch, grow=lambda o: reading.grown(o) or ())
         failures = reading.close(outcomes)
     if failures:
@@ -247,13 +244,11 @@ def read_sources(
     url: str | os.PathLike[str],
     settings: IngestSettings,
     memory: int,
-    points_topic: str | None = None,
-    pose_topic: str | None = None,
+    log_options: LogOptions | None = None,
     scans: ScanSelection | None = None,
 ) -> Reading:
     """What `ingest` begins with; arguments and errors as there."""
-    options = log_options(points_topic, pose_topic, scans)
-    found = within(examine_all(sources, settings, options), memory)
+    found = within(examine_all(sources, settings, log_options, scans), memory)
     store = _create_or_resume(str(url), with_crs(settings, found), found)
     return Reading(store, found, memory, _is_current(store, found))
 
@@ -268,8 +263,7 @@ def plan_ingest(
     url: str | os.PathLike[str],
     settings: IngestSettings,
     memory: int = DEFAULT_MEMORY,
-    points_topic: str | None = None,
-    pose_topic: str | None = None,
+    log_options: LogOptions | None = None,
     scans: ScanSelection | None = None,
 ) -> Plan:
     """What `ingest` would read first, without running or writing anything.
@@ -277,7 +271,7 @@ def plan_ingest(
     The tasks that write tiles are planned from what the reading finds. Arguments and errors as for
     `ingest`; a source that cannot be opened raises its own error here.
     """
-    found = examine_all(sources, settings, log_options(points_topic, pose_topic, scans))
+    found = examine_all(sources, settings, log_options, scans)
     for source in found:
         if source.reason:
             raise SourceError(source.reason)

@@ -179,16 +179,18 @@ def _all_streets(settings: RunSettings) -> tuple[RoutesRead, tuple[str, ...]]:
 
 def _routes(files: Sequence[str], settings: RunSettings, sources: Sequence[str]) -> RoutesRead:
     """The routes of some files, each with a name of its own, in the CRS of the map, which is made
-    from these sources.
+    from these sources. A log that is no drive is read as those of the map.
     """
     map_crs = crs_of_map(sources, settings.store_url, settings.map.crs)
     of_log = {drive.log: drive for drive in reversed(settings.drives)}
     parts = []
     for path in files:  # the way of a drive is that of its own poses
         drive = of_log.get(path)
-        topics = {} if drive is None else drive.model_dump(include={"pose_topic", "points_topic"})
+        options = (settings.map if drive is None else drive).log_options
         project_to = settings.project_to
-        parts.append(read_all_routes(path, project_to=project_to, map_crs=map_crs, **topics))
+        parts.append(
+            read_all_routes(path, project_to=project_to, map_crs=map_crs, log_options=options)
+        )
     return together(parts)
 
 
@@ -205,8 +207,7 @@ def read_map(settings: RunSettings, inputs: Inputs) -> Reading | None:
         settings.store_url,
         ingest_settings(settings.map),
         settings.memory,
-        settings.map.points_topic,
-        settings.map.pose_topic,
+        settings.map.log_options,
         map_scans(settings, inputs),
     )
 
@@ -339,12 +340,11 @@ def reading_of(drive: DriveSettings) -> DriveReading:
     Raises:
         SourceNotFoundError: there is no such log.
     """
-    if not Path(drive.log).is_file():
+    if not Path(drive.log).exists():
         raise SourceNotFoundError(f"{drive.log}: no such log")
     return DriveReading(
         drive.log,
-        drive.points_topic,
-        drive.pose_topic,
+        drive.log_options,
         drive.beams,
         drive.range_max,
         drive.blind_rear_deg,

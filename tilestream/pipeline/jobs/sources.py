@@ -1,7 +1,7 @@
 """The sources of a map: each opened as far as its header, and what became of it."""
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from tilestream.marks import hash_of
 from tilestream.pipeline.engine.plan import megabytes
 from tilestream.pipeline.jobs.strays import Kept
 from tilestream.pipeline.stages.scatter import Fragment, needed_to_open
-from tilestream.settings import IngestSettings
+from tilestream.settings import IngestSettings, LogOptions
 from tilestream.store import open_store
 
 POINTS_PER_TASK = 4_000_000
@@ -45,25 +45,19 @@ class Source:
     """Why it failed; empty where it did not."""
 
 
-def log_options(
-    points_topic: str | None, pose_topic: str | None, scans: ScanSelection | None
-) -> dict[str, Any]:
-    """How the logs among the sources are read, as `formats.open_source` takes it."""
-    wanted = {"points_topic": points_topic, "pose_topic": pose_topic, "scans": scans}
-    return {name: value for name, value in wanted.items() if value is not None}
-
-
 def examine_all(
     sources: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
     settings: IngestSettings,
-    of_logs: dict[str, Any],
+    log_options: LogOptions | None = None,
+    scans: ScanSelection | None = None,
 ) -> list[Source]:
     """Every file that the sources name, opened as far as its header.
 
     Args:
         sources: files, globs and map directories.
         settings: of the map.
-        of_logs: how logs are read (`log_options`).
+        log_options: topics and frames of the logs among them; None: found.
+        scans: which scans of the logs; None: all.
 
     Raises:
         UsageError: there are no sources.
@@ -71,6 +65,8 @@ def examine_all(
     """
     if isinstance(sources, str | os.PathLike):
         sources = [sources]
+    of_logs = {} if log_options is None else log_options.given
+    of_logs |= {} if scans is None else {"scans": scans}
     found: dict[str, Source] = {}
     for pattern in [os.fspath(source) for source in sources]:
         try:
@@ -153,6 +149,15 @@ def crs_of_map(sources: Iterable[str], url: str, asked: str | None) -> str | Non
     try:
         return open_store(url).settings.crs
     except StoreNotFoundError:
-        named = [source for source in sources if not is_log(source)]
+        named = list(_without_logs(sources))
         settings = IngestSettings(crs=asked)
-        return with_crs(settings, examine_all(named, settings, {})).crs if named else asked
+        return with_crs(settings, examine_all(named, settings)).crs if named else asked
+
+
+def _without_logs(sources: Iterable[str]) -> Iterator[str]:
+    """The sources that name no log; of a glob that names some, the files that are none."""
+    for source in sources:
+        if not is_log(source):
+            yield source
+        elif not Path(source).exists():
+            yield from (path for path in expand_sources(source) if not is_log(path))

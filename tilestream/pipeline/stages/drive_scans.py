@@ -2,8 +2,9 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -15,18 +16,17 @@ from tilestream.formats.registry import state_of
 from tilestream.marks import hash_of
 from tilestream.pipeline.engine.stage import Counts
 from tilestream.records import Scan
+from tilestream.settings import LogOptions
 
 
 @dataclass(frozen=True)
 class Reading:
-    """How a log is read: which topics, as if by which sensor."""
+    """How a log is read: its topics and frames, as if by which sensor."""
 
     path: str
     """The log."""
-    points_topic: str | None = None
-    """Topic of the scans; None: found by type."""
-    pose_topic: str | None = None
-    """Topic of the poses; None: found by type."""
+    options: LogOptions = field(default_factory=LogOptions)
+    """Its topics and frames."""
     beams: int | None = None
     """Beams that remain; None: all."""
     range_max: float | None = None
@@ -58,26 +58,38 @@ class Reading:
         self._degraded(Scan(0, np.zeros((0, 3))))
         if self.sweep_s is not None and not 0.0 < self.sweep_s < math.inf:
             raise UsageError(f"sweep is {self.sweep_s!r}: give a positive time in seconds")
-        if "," in (self.points_topic or "") and (self.beams or self.deskew):
+        topic = self.options.points_topic or ""
+        if "," in topic and (self.beams or self.deskew):
             raise UsageError(
-                f"{self.points_topic}: beams and times of points are those of one lidar, and not "
+                f"{topic}: beams and times of points are those of one lidar, and not "
                 "known of several together: leave beams and deskew out, or name one topic"
             )
 
     @property
     def state(self) -> str:
-        """Hash of the log as it is now, and of how it is read."""
-        return hash_of(self, *state_of(self.path))
+        """Hash of the log as it is now, and of how it is read. Options that are not given are left
+        out, so that one more of them changes no hash.
+        """
+        own = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "options"}
+        topics = {"points_topic": None, "pose_topic": None}
+        how: dict[str, Any] = {**own, **topics, **self.options.given}
+        return hash_of(how, *state_of(self.path))
 
     def open(self) -> ScanLog:
         """The log."""
-        return open_log(self.path, points_topic=self.points_topic, pose_topic=self.pose_topic)
+        return open_log(self.path, self.options)
 
     def seen(self, scan: Scan, log: ScanLog) -> Scan:
         """A scan of the log as it is to be localized."""
         if self.deskew:
             sweep = None if self.sweep_s is None else Sweep(self.sweep_s)
-            scan = deskew(scan, log.trajectory, sweep=sweep)
+            scan = deskew(
+                scan,
+                log.trajectory,
+                sweep=sweep,
+                max_gap_s=self.options.max_gap_s,
+                max_speed_mps=self.options.max_speed_mps,
+            )
         return self._degraded(scan)
 
     def _degraded(self, scan: Scan) -> Scan:

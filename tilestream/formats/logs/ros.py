@@ -1,7 +1,7 @@
-"""ROS 2 messages as bytes (CDR) and back to numbers: clouds and poses.
+"""ROS messages as bytes and back to numbers: clouds and poses.
 
 Only the five types that carry scans and poses, whose layout ROS fixes; so a log's own schema
-texts (or IDL, or none) do not matter.
+texts (or IDL, or none) do not matter. ROS 2 writes them as CDR, ROS 1 without gaps.
 """
 
 import struct
@@ -17,6 +17,9 @@ ODOMETRY = "nav_msgs/Odometry"
 POSE = "geometry_msgs/PoseStamped"
 POSE_COVARIANCE = "geometry_msgs/PoseWithCovarianceStamped"
 TF = "tf2_msgs/TFMessage"
+POSE_TYPES = (ODOMETRY, POSE, POSE_COVARIANCE)
+OTHER_NAMES = {"tf/tfMessage": TF}
+"""Types that ROS 1 had another name for."""
 
 POINT_FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """sensor_msgs/PointField's datatype -> NumPy type, byte order aside."""
@@ -35,6 +38,9 @@ class Cdr:
     def take(self, kind: str, count: int = 1) -> tuple[float, ...]:
         """`count` numbers of one `struct` code, aligned to their size."""
         self.at += -(self.at - 4) % struct.calcsize("=" + kind)
+        return self._next(kind, count)
+
+    def _next(self, kind: str, count: int) -> tuple[float, ...]:
         code = f"{self.order}{count}{kind}"
         values = struct.unpack_from(code, self.data, self.at)
         self.at += struct.calcsize(code)
@@ -63,6 +69,28 @@ class Cdr:
         return seconds * 1_000_000_000 + nanoseconds, self.text().lstrip("/")
 
 
+class Ros1(Cdr):
+    """The fields of a ROS 1 message: little-endian, no gaps, a number in each header."""
+
+    def __init__(self, data: memoryview) -> None:
+        self.order = "<"
+        self.data = data
+        self.at = 0
+
+    def take(self, kind: str, count: int = 1) -> tuple[float, ...]:
+        """`count` numbers of one `struct` code."""
+        return self._next(kind, count)
+
+    def header(self) -> tuple[int, str]:
+        """std_msgs/Header: stamp [ns] and frame, a leading slash taken off."""
+        _, seconds, nanoseconds = self.take("I", 3)
+        return int(seconds) * 1_000_000_000 + int(nanoseconds), self.text().lstrip("/")
+
+
+ENCODINGS = {"cdr": Cdr, "ros1": Ros1}
+"""How messages are written, by the name that MCAP has for it."""
+
+
 @dataclass(frozen=True)
 class Pose:
     """A pose at a time: where the frame `child` is in the frame `parent`."""
@@ -77,14 +105,14 @@ class Pose:
     """x, y, z [m], qx, qy, qz, qw."""
 
 
-def read_poses(message_type: str, data: memoryview) -> list[Pose]:
-    """The poses in a message of one of the four types that carry them.
+def read_poses(message_type: str, data: memoryview, encoding: str) -> list[Pose]:
+    """The poses in a message of one of the four types that carry them, in one of `ENCODINGS`.
 
     Raises:
         CorruptSourceError: the message is shorter than its type.
     """
     try:
-        cdr = Cdr(data)
+        cdr = ENCODINGS[encoding](data)
         if message_type == TF:
             return [_transform(cdr) for _ in range(cdr.integer())]
         stamp, parent = cdr.header()
@@ -132,15 +160,19 @@ class Cloud:
         return np.ndarray(shape, self.dtype, buffer=self.data, strides=strides).reshape(-1)
 
 
-def read_cloud(data: memoryview) -> Cloud:
+def read_cloud(data: memoryview, encoding: str) -> Cloud:
     """The layout of a cloud, checked against its bytes; the points stay packed.
+
+    Args:
+        data: the message.
+        encoding: one of `ENCODINGS`.
 
     Raises:
         CorruptSourceError: x, y or z is missing or not a float, a field has an unknown type or
             lies outside of the point, or the data is shorter than height, width and steps say.
     """
     try:
-        cdr = Cdr(data)
+        cdr = ENCODINGS[encoding](data)
         stamp, frame = cdr.header()
         height, width = cdr.integer(), cdr.integer()
         fields = [
