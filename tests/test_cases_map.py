@@ -195,7 +195,7 @@ def test_the_map_s_own_projector_serves_its_lanes(
     assert run(["factors", store.url, *asked]) == 0
     told = json.loads(capsys.readouterr().out)
     assert (told["sample_points"], told["done"]) == (31, 31)
-    (note,) = told["notes"]
+    (note,) = told["notes"][str(lanes)]
     assert "brought from degrees" in note
     assert planned(folder, tmp_path) == 0
     assert "1 lanes of" in " ".join(capsys.readouterr().out.split())

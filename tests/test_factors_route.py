@@ -244,7 +244,7 @@ def test_the_command(
     assert json.loads(capsys.readouterr().out) == {
         "sample_points": 9,
         "done": 9,
-        "notes": [],
+        "notes": {},
     }
     assert run([*command, "--spacing", "6"]) == 0
     assert "feature_count" in capsys.readouterr().out

@@ -6,9 +6,12 @@ from typing import Annotated
 
 import typer
 
-from tilestream.cli.printing import err, say
+from tilestream.cli.printing import say_notes
 from tilestream.errors import PartialError, UsageError
 from tilestream.formats.routes import RoutesRead, read_all_routes, together
+from tilestream.notes import noticed
+from tilestream.pipeline.jobs.sources import map_notes
+from tilestream.store import TileStore
 
 StoreUrl = Annotated[str, typer.Argument(help="The tile store.")]
 Routes = Annotated[list[str], typer.Option(help="TUM, KITTI, CSV, GeoJSON, Lanelet2 or MCAP.")]
@@ -36,21 +39,23 @@ def numbers(lists: list[str], option: str) -> list[float]:
 
 @contextmanager
 def routes_of(
-    files: list[str], project_to: str | None, spacing: float, map_crs: str | None
-) -> Iterator[RoutesRead]:
-    """The routes of all files that can be used; their notes are printed.
+    files: list[str], project_to: str | None, spacing: float, store: TileStore
+) -> Iterator[tuple[RoutesRead, dict[str, list[str]]]]:
+    """The routes of all files that can be used, and the notes on them and on their map by source,
+    which are printed.
 
     Raises:
         SourceError, UsageError: none of them can be used; says why the first cannot.
         PartialError: when all is done with the good ones, some cannot be used; lists them, with
             what else failed.
     """
+    map_crs = store.settings.crs
     read = together(read_all_routes(path, project_to=project_to, map_crs=map_crs) for path in files)
     read = read.at_least(spacing)
-    for note in read.notes:
-        say(note, to=err)
+    notes = noticed(map_notes(store), read.notes_of(files))
+    say_notes(notes)
     try:
-        yield read
+        yield read, notes
     except PartialError as error:
         raise error.with_more(read.failures) from None
     if read.failures:

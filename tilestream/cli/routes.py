@@ -1,5 +1,6 @@
 """The commands along routes and drives: measure errors, compute factors, compare sensors."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,7 +11,7 @@ from tilestream.cli.cluster import HERE, Cluster, on_cluster
 from tilestream.cli.fields import fields, with_settings
 from tilestream.cli.maps import LOG_FIELDS
 from tilestream.cli.options import AsJson, DryRun, Routes, StoreUrl, numbers, routes_of
-from tilestream.cli.printing import out, print_json, say
+from tilestream.cli.printing import out, print_json, say, say_notes
 from tilestream.cli.progress import progress
 from tilestream.cli.tables import (
     comparison_table,
@@ -19,14 +20,19 @@ from tilestream.cli.tables import (
     factor_table,
     plan_table,
 )
-from tilestream.errors import PartialError
+from tilestream.errors import LimitError, PartialError
 from tilestream.factors.catalogue import Which
+from tilestream.notes import noticed
 from tilestream.pipeline.jobs import along_routes
 from tilestream.pipeline.jobs import localize as localize_drive
+from tilestream.pipeline.jobs.drive_measured import drive_measured
 from tilestream.pipeline.jobs.run_inputs import reading_of, scans_of
+from tilestream.pipeline.jobs.sources import map_notes
+from tilestream.pipeline.stages.drive_scans import opened as opened_log
 from tilestream.pipeline.stages.factors import Looking
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.report import write_comparison
+from tilestream.report.drives import EVALUATED
 from tilestream.report.segments import check_threshold
 from tilestream.sensor import SENSORS, sensor_of
 from tilestream.settings import (
@@ -87,6 +93,9 @@ def localize(
         "memory": places.memory,
     }
     opened, reading = open_store(store), reading_of(drive)
+    log = opened_log(reading)
+    notes = noticed(map_notes(opened), {drive.log: log.notes})
+    say_notes(notes)
     if dry_run:
         out.print(
             plan_table(
@@ -107,15 +116,23 @@ def localize(
             watch=watch,
             partial=which_map.partial,
         )
+    measured = drive_measured(drive.log, log, how["scans"], places.spacing, found)
     if as_json:
-        print_json({"matcher": registration.told, **error_facts(found)})
+        facts = error_facts(found)
+        told = {"matcher": registration.told, "drive": measured.plain(), "notes": notes}
+        print_json({**told, **facts})
     else:
-        out.print(error_table(found, registration.told))
+        out.print(error_table(found, registration.told, measured))
         say(f"The tables are in {folder}/errors and {folder}/starts")
     failed = found[found["status"] != "done"]
     if len(failed):
         reasons = {f"scan {s}": r for s, r in zip(failed["scan"], failed["reason"], strict=True)}
         raise PartialError(f"{drive.log}: {len(failed)} of {len(found)} scans failed:", reasons)
+    if not measured.evaluated:
+        raise LimitError(
+            f"{drive.log}: {measured}: less than {EVALUATED:.0%} of what was selected was "
+            "evaluated; --from-s and --until-s select a part that has poses"
+        )
 
 
 @on_cluster
@@ -136,7 +153,7 @@ def factors(
 ) -> None:
     """Compute the factors of the map at every sample point of a route."""
     opened = open_store(store)
-    with routes_of(route, places.project_to, places.spacing, opened.settings.crs) as read:
+    with routes_of(route, places.project_to, places.spacing, opened) as (read, notes):
         routes = read.routes
         sensor, height = places.looking_sensor, places.sensor_height
         if dry_run:
@@ -164,7 +181,7 @@ def factors(
         counts = rows["status"].value_counts()
         if as_json:
             found = {str(status): int(count) for status, count in counts.items()}
-            print_json({"sample_points": len(rows), **found, "notes": list(read.notes)})
+            print_json({"sample_points": len(rows), **found, "notes": notes})
         else:
             out.print(factor_table(rows))
             say(f"The tables are in {folder}/factors")
@@ -206,7 +223,7 @@ def compare(
     for limit in (report.threshold, cap):
         check_threshold(limit)
     opened = open_store(store)
-    with routes_of(route, places.project_to, places.spacing, opened.settings.crs) as read:
+    with routes_of(route, places.project_to, places.spacing, opened) as (read, notes):
         routes = read.routes
         choices = comparing.choices_of(
             [sensor_of(name) for name in sensor],
@@ -244,8 +261,9 @@ def compare(
                 watch=watch,
                 partial=which_map.partial,
             )
+        found = replace(found, notes=notes)
         content = write_comparison(found, folder, threshold=report.threshold, cap=cap)
-        _show_comparison({**content, "notes": list(read.notes)}, store, folder, as_json)
+        _show_comparison(content, store, folder, as_json)
 
 
 def _show_comparison(content: dict[str, Any], store: str, folder: str, as_json: bool) -> None:

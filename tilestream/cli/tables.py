@@ -14,6 +14,7 @@ from tilestream.formats.base import SourceInfo
 from tilestream.pipeline.engine.costs import core_hours
 from tilestream.pipeline.engine.plan import Plan, megabytes
 from tilestream.pipeline.jobs.forecast import Forecast
+from tilestream.report.drives import DriveMeasured
 from tilestream.store import POINTS, TileStore
 
 
@@ -99,6 +100,8 @@ def info_table(found: SourceInfo) -> Table:
             table.add_row(name, "  ".join(f"{value:.3f}" for value in corner))
     table.add_row("fields", ", ".join(f"{name}: {kind}" for name, kind in found.fields))
     table.add_row("CRS", found.crs or "none in the file")
+    for line in found.contents:
+        table.add_row("holds", line)
     for note in found.notes:
         table.add_row("note", note)
     return table
@@ -160,13 +163,15 @@ READ_AS = {
 """Scale, unit and meaning of the facts of a drive, for people."""
 
 
-def error_table(labels: pd.DataFrame, matcher: str) -> Table:
-    """The errors of a drive, figure and meaning, and its worst places."""
+def error_table(labels: pd.DataFrame, matcher: str, drive: DriveMeasured) -> Table:
+    """The errors of a drive, figure and meaning, how much of it they are of, its worst places."""
     table = Table(title="localization error", title_justify="left", box=SIMPLE, show_header=False)
     table.add_column(justify="right", no_wrap=True)
     table.add_column()
     facts = error_facts(labels)
     table.add_row(matcher, "the matcher")
+    why = f"; of the others {drive.why}" if drive.reasons else ""
+    table.add_row(f"{drive.measured:,} of {drive.scans:,}", f"scans measured{why}")
     table.add_row(f"{facts['sample_points']:,}", "sample points")
     table.add_row(f"{facts['failed']:,}", "of them without a measurement")
     for name, (scale, unit, meaning) in READ_AS.items():

@@ -134,9 +134,13 @@ def _joined(
     reason = np.where(failed, "label failed", "").astype(object)
     at = labels[["x", "y", "z"]].to_numpy(np.float64)
     reason[(reason == "") & ~np.isfinite(at).all(axis=1)] = "label without a position"
-    distance, second, place = _nearest(places[["x", "y", "z"]].to_numpy(np.float64), at)
-    open_ = reason == ""
-    reason[open_ & ~(distance <= tolerance)] = "no sample point within the tolerance"
+    xyz = places[["x", "y", "z"]].to_numpy(np.float64)
+    distance, second, place = _nearest(xyz, at)
+    far = (reason == "") & ~(distance <= tolerance)
+    reason[far] = "no sample point within the tolerance"
+    detail[far] = _how_far(
+        at[far & np.isfinite(distance)] - xyz[place[far & np.isfinite(distance)]]
+    )
     reason[(reason == "") & (second <= distance + SAME)] = "two sample points equally near"
     _nearest_scan_only(reason, place, distance)
     kept = [n for n in (*TARGETS, "sample", "true_pose", "as_sensor", "status") if n in labels]
@@ -161,6 +165,18 @@ def _nearest(places: Float64, at: Float64) -> tuple[Float64, Float64, Int64]:
         first[finite], second[finite] = distance[:, 0], distance[:, 1]
         place[finite] = usable[np.minimum(index[:, 0], usable.size - 1)]
     return first, second, place
+
+
+def _how_far(apart: Float64) -> str:
+    """In words, how far labels are from their nearest sample points, (n, 3) [m]."""
+    if not len(apart):
+        return ""
+    ways = {"horizontally": np.hypot(apart[:, 0], apart[:, 1]), "vertically": abs(apart[:, 2])}
+    told = [
+        f"{way} at least {far.min():.2f} m, median {np.median(far):.2f} m"
+        for way, far in ways.items()
+    ]
+    return f"from the nearest {', '.join(told)}"
 
 
 def _nearest_scan_only(reason: NDArray[np.object_], place: Int64, distance: Float64) -> None:

@@ -10,6 +10,7 @@ simulate? -> scatter -> merge, cells, terms, factors, surfels, observe, register
 import json
 import os
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -41,10 +42,10 @@ from tilestream.pipeline.jobs.run_findings import Done, findings_of
 from tilestream.pipeline.jobs.run_inputs import (
     Inputs,
     check_model,
-    degraded_drives,
     inputs_of,
     read_map,
 )
+from tilestream.pipeline.jobs.run_notes import drives_measured, lost_labels, run_notes
 from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
 from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
 from tilestream.pipeline.stages.map_plan import MapPlan
@@ -108,7 +109,7 @@ def _run(settings: RunSettings, client: Any | None, watch: Watch | None) -> Path
         with report_kept(client, settings.folder / "dask-performance.html"):
             inputs = inputs_of(settings, client, watch)
             book.failures |= inputs.failures
-            book.facts["notes"] = [*inputs.notes, *_on_degraded(settings, inputs)]
+            book.facts["notes"] = dict(inputs.notes)
             story = _Story(settings, inputs, book)
             execute(story.first(), client, book.listening(watch), grow=story.grown)
             if story.estimate is None:
@@ -117,6 +118,7 @@ def _run(settings: RunSettings, client: Any | None, watch: Watch | None) -> Path
                 _estimate_large(story.estimate, client, book.listening(watch))
         learn(book.tasks, book.outcomes)
         settle(book.tasks, book.failures)
+        book.facts["notes"] = run_notes(settings, inputs, story.store)
         _report(settings, inputs, story, book)
     book.facts["files"] = checksums(settings.folder)
     for name in ("", "tables", "report", "report/figures"):
@@ -260,6 +262,8 @@ def _report(settings: RunSettings, inputs: Inputs, story: _Story, book: Book) ->
     """Gather what is done and write the report; without a single factor table there is none."""
     good = {outcome.key for outcome in book.outcomes if outcome.ok}
     done = Done(tuple(task for task in book.tasks if task.key in good))
+    measured = drives_measured(settings, inputs, done)
+    book.facts["drives"] = [drive.plain() for drive in measured]
     if not done.outputs("factors"):
         return
     known = done.dataset()
@@ -272,6 +276,9 @@ def _report(settings: RunSettings, inputs: Inputs, story: _Story, book: Book) ->
         known,
         _facts(settings, inputs, book, known),
         model=settings.model,
+    )
+    found = replace(
+        found, notes=book.facts["notes"], drives=measured, lost_labels=lost_labels(known)
     )
     text = json.dumps(plain(evaluation), indent=1, allow_nan=False)
     write_text(settings.folder / "tables" / "evaluation.json", text + "\n")
@@ -292,7 +299,6 @@ def _facts(
         "map": settings.store_url,
         "sensor": settings.vehicle.name,
         "labelled places": 0 if known is None else len(known),
-        "lost labels": {} if known is None else known.losses,
         "model": _model_facts(settings, book),
         "matcher": {
             "name": settings.label.registration.told,
@@ -302,19 +308,8 @@ def _facts(
         "drives": {d.group: d.model_dump(exclude_defaults=True) for d in inputs.drives},
         "core-seconds by stage, all calls": stages,
         "failures": dict(book.failures),
-        "notes": book.facts["notes"],
         "attributions": list(inputs.attributions),
     }
-
-
-def _on_degraded(settings: RunSettings, inputs: Inputs) -> list[str]:
-    """What a reader must know of drives that were read as another lidar than the vehicle's."""
-    others = degraded_drives(settings, inputs.drives)
-    groups = [drive.group for drive in inputs.drives if drive.degraded in others]
-    if not groups:
-        return []
-    told = f"observed as the lidar that they are read as: {', '.join(groups)}"
-    return [f"{told}; the estimates along the routes are for the vehicle as it is"]
 
 
 def _model_facts(settings: RunSettings, book: Book) -> dict[str, Any]:

@@ -1,0 +1,86 @@
+"""What a run noticed of its inputs, and how much of its drives it measured and can use."""
+
+from typing import Any
+
+import pandas as pd
+
+from tilestream.errors import SourceError
+from tilestream.model.dataset import Dataset
+from tilestream.notes import noticed
+from tilestream.pipeline.engine.outputs import Parquet
+from tilestream.pipeline.jobs.drive_measured import drive_measured
+from tilestream.pipeline.jobs.run_findings import Done
+from tilestream.pipeline.jobs.run_inputs import (
+    JOB,
+    Inputs,
+    degraded_drives,
+    reading_of,
+    scans_of,
+)
+from tilestream.pipeline.jobs.run_settings import RunSettings
+from tilestream.pipeline.jobs.sources import map_notes
+from tilestream.pipeline.stages.drive_scans import opened
+from tilestream.pipeline.stages.label import label
+from tilestream.report.drives import DriveMeasured
+from tilestream.settings import DriveSettings
+from tilestream.store import TileStore
+
+NO_ROWS = pd.DataFrame({"status": [], "reason": []})
+"""Where a drive has no labels."""
+
+
+def run_notes(settings: RunSettings, inputs: Inputs, store: TileStore) -> dict[str, list[str]]:
+    """All that was noticed of the inputs of a run whose map is there, by source."""
+    of_drives = {drive.log: _notes_of(drive) for drive in inputs.drives}
+    own = {JOB: _on_degraded(settings, inputs)}
+    return noticed(inputs.notes, own, map_notes(store), of_drives)
+
+
+def _notes_of(drive: DriveSettings) -> list[str]:
+    try:
+        return list(opened(reading_of(drive)).notes)
+    except (SourceError, OSError) as error:  # its tasks have failed for that, and are listed
+        return [f"cannot be read any more: {error}"]
+
+
+def _on_degraded(settings: RunSettings, inputs: Inputs) -> list[str]:
+    """What a reader must know of drives that were read as another lidar than the vehicle's."""
+    others = degraded_drives(settings, inputs.drives)
+    groups = [drive.group for drive in inputs.drives if drive.degraded in others]
+    if not groups:
+        return []
+    told = f"observed as the lidar that they are read as: {', '.join(groups)}"
+    return [f"{told}; the estimates along the routes are for the vehicle as it is"]
+
+
+def drives_measured(settings: RunSettings, inputs: Inputs, done: Done) -> tuple[DriveMeasured, ...]:
+    """How much of each drive was measured; a log that is gone is left out."""
+    tables: dict[str, list[pd.DataFrame]] = {}
+    for task in done.outputs(label.name):
+        assert isinstance(task.writes, Parquet)
+        group = task.writes.path.rsplit("/", 2)[1]
+        tables.setdefault(group, []).append(task.writes.read().rows)
+    found = []
+    for drive in inputs.drives:
+        try:
+            log = opened(reading_of(drive))
+        except (SourceError, OSError):
+            continue
+        rows = pd.concat(tables.get(drive.group, [NO_ROWS]), ignore_index=True)
+        found.append(drive_measured(drive.group, log, scans_of(drive), settings.spacing, rows))
+    return tuple(found)
+
+
+def lost_labels(dataset: Dataset | None) -> list[dict[str, Any]]:
+    """The labels that no model can learn from: `reason`, `count`, and in `detail` the commonest of
+    what is known besides; the commonest reason first.
+    """
+    if dataset is None or dataset.lost.empty:
+        return []
+    found = []
+    for reason, rows in dataset.lost.groupby("reason"):
+        detail = rows["detail"].astype(str).value_counts()
+        more = f" (and {len(detail) - 1:,} others)" if len(detail) > 1 else ""
+        told = str(detail.index[0]) + more if detail.index[0] else ""
+        found.append({"reason": str(reason), "count": len(rows), "detail": told})
+    return sorted(found, key=lambda lost: (-int(str(lost["count"])), str(lost["reason"])))
