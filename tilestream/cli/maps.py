@@ -6,6 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from tilestream.apps import diff as map_diff
+from tilestream.apps import info as describing
 from tilestream.apps import verify as verifying
 from tilestream.cli.cluster import HERE, Cluster, on_cluster
 from tilestream.cli.fields import fields, with_settings
@@ -14,7 +15,6 @@ from tilestream.cli.printing import out, print_json, say, say_notes
 from tilestream.cli.progress import progress
 from tilestream.cli.tables import TILE_CHANGES, diff_table, info_table, plan_table, tile_table
 from tilestream.errors import PartialError
-from tilestream.formats import describe
 from tilestream.pipeline.jobs import ingest as ingest_map
 from tilestream.pipeline.jobs.run_inputs import ingest_settings, scans_of
 from tilestream.pipeline.jobs.sources import map_notes
@@ -146,13 +146,16 @@ def _why_left(damage: verifying.Damage) -> str:
 
 
 def info(
-    file: Annotated[str, typer.Argument(help="Any supported file, log or map directory.")],
+    file: Annotated[
+        str,
+        typer.Argument(help="Points, a log, routes, a map folder, a store, a run, or a model."),
+    ],
     as_json: AsJson = False,
 ) -> None:
-    """Show what is in a file or log: points, bounds, fields, topics, CRS."""
-    found = describe(file)
+    """Show what is in anything that is read or made: extent, CRS, coverage, state, notes."""
+    found = describing.info(file)
     if as_json:
-        print_json(asdict(found))
+        print_json(found.plain())
     else:
         out.print(info_table(found))
 
