@@ -66,7 +66,7 @@ def localize(
     folder: Annotated[str, typer.Option("--out", help="Folder of the tables.")],
     which_map: Annotated[MapSettings, fields("partial")],
     places: Annotated[PlaceSettings, fields("cell_size", "spacing", "memory")],
-    labels: Annotated[LabelSettings, fields("matcher", "true_pose")],
+    labels: Annotated[LabelSettings, fields("matcher", "true_pose", "allow_overlap")],
     leaf: Annotated[RegistrationSettings, fields("scan_leaf")],
     starts: Annotated[StartSettings, fields("radius", "step")],
     drive: Annotated[
@@ -94,8 +94,11 @@ def localize(
     }
     opened, reading = open_store(store), reading_of(drive)
     log = opened_log(reading)
-    notes = noticed(map_notes(opened), {drive.log: log.notes})
+    shared = localize_drive.drive_overlap(reading, how["scans"], places.spacing, opened.sources())
+    notes = noticed(map_notes(opened), {drive.log: [*log.notes, *shared.notes]})
     say_notes(notes)
+    if not labels.allow_overlap:
+        shared.require_none()
     if dry_run:
         out.print(
             plan_table(
@@ -115,6 +118,7 @@ def localize(
             client=client,
             watch=watch,
             partial=which_map.partial,
+            allow_overlap=labels.allow_overlap,
         )
     measured = drive_measured(drive.log, log, how["scans"], places.spacing, found)
     if as_json:

@@ -4,10 +4,12 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import pandas as pd
+from scipy.spatial import cKDTree
 
 from tilestream.crs import require_same
-from tilestream.errors import PartialError
+from tilestream.errors import PartialError, TileNotReadyError
 from tilestream.factors.catalogue import Which
 from tilestream.factors.rows import Samples, in_route_order, samples_by_tile
 from tilestream.grid import TileKey, whole_mm
@@ -16,7 +18,7 @@ from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, paths_of
 from tilestream.pipeline.engine.stage import Stage
 from tilestream.pipeline.jobs.inventory import make_tables
 from tilestream.pipeline.stages.factors import Looking, factors, factors_task
-from tilestream.pipeline.stages.map_plan import MapPlan
+from tilestream.pipeline.stages.map_plan import MapPlan, apart
 from tilestream.pipeline.stages.observe import Observing, observe, observe_task
 from tilestream.records import Route
 from tilestream.sensor import VLP16, Carrier, Sensor
@@ -24,6 +26,8 @@ from tilestream.settings import LabelSettings, RegistrationSettings, VirtualSett
 from tilestream.store import TileStore
 from tilestream.tables import read_tables
 
+REACH = 250.0
+"""How far from a map a route is refused [m]: nothing of the map is in view of any lidar there."""
 SENSOR_HEIGHT = 2.0
 """Height of the lidar above the road [m] (the paper's vehicle)."""
 
@@ -99,6 +103,25 @@ def samples_along(
     return samples_by_tile(store.grid, routes, spacing)
 
 
+def require_near(map_plan: MapPlan, samples: Mapping[TileKey, Samples]) -> None:
+    """Refuse routes of which none comes near a map, before any work.
+
+    Args:
+        map_plan: the map.
+        samples: the sample points by tile.
+
+    Raises:
+        TileNotReadyError: where both are, and what to do.
+    """
+    have, wanted = (np.array(list(keys)).reshape(-1, 2) for keys in (map_plan.points, samples))
+    if not len(have) or not len(wanted):  # of a map that is not read yet
+        return
+    distances = np.asarray(cKDTree(have).query(wanted, p=np.inf)[0])
+    if distances.min() > np.ceil(REACH / map_plan.store.settings.tile_size):
+        places = np.concatenate([some.places for some in samples.values()])
+        raise TileNotReadyError(f"the route {apart(map_plan, places, REACH)}")
+
+
 def plan_factors(
     map_plan: MapPlan,
     samples: Mapping[TileKey, Samples],
@@ -116,6 +139,7 @@ def plan_factors(
         memory: what a task may use [bytes].
     """
     map_plan.store.grid.require_cell_size(whole_mm(looking.cell_size, "cell_size"))
+    require_near(map_plan, samples)
     folder = os.fspath(out)
     tasks = [factors_task(map_plan, key, some, looking, folder) for key, some in samples.items()]
     return Plan.of((*map_plan.tasks.values(), *tasks), memory)
@@ -201,6 +225,7 @@ def plan_observe(
         applies: `observe`, or `observe_drive`.
     """
     map_plan.store.grid.require_cell_size(whole_mm(observing.cell_size, "cell_size"))
+    require_near(map_plan, samples)
     folder = os.fspath(out)
     tasks = [
         observe_task(map_plan, key, some, observing, folder, group, applies)

@@ -1,6 +1,7 @@
 """What the main job would run, from headers alone: before anything is read or written."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from tilestream.pipeline.jobs.run_inputs import (
     simulated_folder,
     simulations,
 )
+from tilestream.pipeline.jobs.run_notes import with_overlaps
 from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
 from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.jobs.simulate import plan_simulation
@@ -60,7 +62,8 @@ def forecast(settings: RunSettings) -> Forecast:
     if settings.simulate is not None and not is_simulated(settings):
         return _simulation_first(settings, settings.simulate)
     inputs = inputs_of(settings, None, None)
-    map_plan, reading, notes = _expected_map(settings, inputs)
+    map_plan, reading, notes, sources = _expected_map(settings, inputs)
+    inputs = with_overlaps(settings, inputs, sources)
     measure = plan_measure(settings, inputs, map_plan)
     done = [Outcome(task.key, task.stage) for task in measure.tasks]
     estimate = plan_estimate(settings, map_plan.store.grid, measure, done)
@@ -83,8 +86,10 @@ def _simulation_first(settings: RunSettings, wanted: SimulateSettings) -> Foreca
     return Forecast(tuple(missing.values()), {PLAN: [note]})
 
 
-def _expected_map(settings: RunSettings, inputs: Inputs) -> tuple[MapPlan, tuple[Task, ...], Notes]:
-    """The map as it is, or as the bounds of its sources let expect it."""
+def _expected_map(
+    settings: RunSettings, inputs: Inputs
+) -> tuple[MapPlan, tuple[Task, ...], Notes, list[dict[str, Any]]]:
+    """The map as it is, or as the bounds of its sources let expect it; its sources as recorded."""
     try:
         store = open_store(settings.store_url)
     except StoreNotFoundError:
@@ -94,7 +99,8 @@ def _expected_map(settings: RunSettings, inputs: Inputs) -> tuple[MapPlan, tuple
         if store.sources():
             told = {PLAN: ["the map is there; changed sources are read again"]}
             partial = bool(inputs.sources) or settings.map.partial
-            return MapPlan.of_store(store, partial=partial), (), noticed(told, map_notes(store))
+            there = MapPlan.of_store(store, partial=partial)
+            return there, (), noticed(told, map_notes(store)), store.sources()
     planned = plan_ingest(
         inputs.sources,
         settings.store_url,
@@ -119,4 +125,6 @@ def _expected_map(settings: RunSettings, inputs: Inputs) -> tuple[MapPlan, tuple
     notes = [f"at most {len(have)} tiles, by the bounds of the sources; reading tells which"]
     if unknown:
         notes.append(f"only reading tells where the points of {', '.join(unknown[:3])} are")
-    return MapPlan(store, have), planned.scatters.tasks, noticed({PLAN: notes}, planned.notes)
+    sources = [source.record for source in planned.found]
+    told = noticed({PLAN: notes}, planned.notes)
+    return MapPlan(store, have), planned.scatters.tasks, told, sources

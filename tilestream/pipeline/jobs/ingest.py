@@ -229,24 +229,7 @@ class Reading:
 
     def _record(self) -> None:
         fragments_of(self.store.url).remove()
-        self.store.end(
-            [
-                {
-                    "path": source.path,
-                    "state": source.state,
-                    "format": source.info.format if source.info else "",
-                    "size_bytes": source.info.size_bytes if source.info else 0,
-                    "crs": source.info.crs if source.info else None,
-                    "contents": list(source.info.contents) if source.info else [],
-                    "notes": list(source.info.notes) if source.info else [],
-                    "points": source.points,
-                    "dropped": source.dropped,
-                    "reason": source.reason,
-                }
-                for source in self.found
-            ],
-            MADE_BY,
-        )
+        self.store.end([source.record for source in self.found], MADE_BY)
 
 
 def read_sources(

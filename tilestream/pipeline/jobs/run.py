@@ -45,7 +45,12 @@ from tilestream.pipeline.jobs.run_inputs import (
     inputs_of,
     read_map,
 )
-from tilestream.pipeline.jobs.run_notes import drives_measured, lost_labels, run_notes
+from tilestream.pipeline.jobs.run_notes import (
+    drives_measured,
+    lost_labels,
+    run_notes,
+    with_overlaps,
+)
 from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
 from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
 from tilestream.pipeline.stages.map_plan import MapPlan
@@ -111,6 +116,7 @@ def _run(settings: RunSettings, client: Any | None, watch: Watch | None) -> Path
             book.failures |= inputs.failures
             book.facts["notes"] = dict(inputs.notes)
             story = _Story(settings, inputs, book)
+            inputs = story.inputs
             execute(story.first(), client, book.listening(watch), grow=story.grown)
             if story.estimate is None:
                 story.estimate = story.plan_estimate()
@@ -161,12 +167,14 @@ class _Story:
 
     def __init__(self, settings: RunSettings, inputs: Inputs, book: Book) -> None:
         self.settings = settings
-        self.inputs = inputs
         self.book = book
         self.reading: Reading | None = read_map(settings, inputs)
         self.store: TileStore = (
             self.reading.store if self.reading else open_store(settings.store_url)
         )
+        found = self.reading.found if self.reading else None
+        sources = self.store.sources() if found is None else [source.record for source in found]
+        self.inputs = with_overlaps(settings, inputs, sources)
         self.measure = Plan((), settings.memory)
         self.estimate: Plan | None = None
         """None: not planned yet, or to be grown by all workers together."""

@@ -1,5 +1,7 @@
 """What a run noticed of its inputs, and how much of its drives it measured and can use."""
 
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import pandas as pd
@@ -9,6 +11,7 @@ from tilestream.model.dataset import Dataset
 from tilestream.notes import noticed
 from tilestream.pipeline.engine.outputs import Parquet
 from tilestream.pipeline.jobs.drive_measured import drive_measured
+from tilestream.pipeline.jobs.localize import drive_overlap
 from tilestream.pipeline.jobs.run_findings import Done
 from tilestream.pipeline.jobs.run_inputs import (
     JOB,
@@ -34,6 +37,25 @@ def run_notes(settings: RunSettings, inputs: Inputs, store: TileStore) -> dict[s
     of_drives = {drive.log: _notes_of(drive) for drive in inputs.drives}
     own = {JOB: _on_degraded(settings, inputs)}
     return noticed(inputs.notes, own, map_notes(store), of_drives)
+
+
+def with_overlaps(
+    settings: RunSettings, inputs: Inputs, sources: Sequence[Mapping[str, Any]]
+) -> Inputs:
+    """The files of a job, with notes on what its drives share with the sources of its map, as a
+    store records these.
+
+    Raises:
+        UsageError: scans that are to be localized are in the map, and not `allow_overlap`.
+        SourceError: a log that cannot be read.
+    """
+    notes: dict[str, list[str]] = {}
+    for drive in inputs.drives:
+        shared = drive_overlap(reading_of(drive), scans_of(drive), settings.spacing, sources)
+        if not settings.label.allow_overlap:
+            shared.require_none()
+        notes.setdefault(drive.log, []).extend(shared.notes)
+    return replace(inputs, notes=noticed(inputs.notes, notes))
 
 
 def _notes_of(drive: DriveSettings) -> list[str]:

@@ -10,11 +10,13 @@ from tilestream.crs import named, one_crs
 from tilestream.errors import SourceError, SourceNotFoundError, StoreNotFoundError, UsageError
 from tilestream.formats import expand_sources, open_source
 from tilestream.formats.base import SourceInfo, Span
+from tilestream.formats.drive import DriveSource
 from tilestream.formats.logs import ScanSelection, is_log
 from tilestream.formats.registry import state_of
 from tilestream.marks import hash_of
 from tilestream.notes import noticed
 from tilestream.pipeline.engine.plan import megabytes
+from tilestream.pipeline.jobs.overlap import packed
 from tilestream.pipeline.jobs.strays import Kept
 from tilestream.pipeline.stages.scatter import Fragment, needed_to_open
 from tilestream.settings import IngestSettings
@@ -42,8 +44,28 @@ class Source:
     """Finite points that were read."""
     dropped: int = 0
     """Points that were not finite."""
+    scans: str = ""
+    """The scans of a log that become map points (`overlap.packed`)."""
     reason: str = ""
     """Why it failed; empty where it did not."""
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """What a store keeps of it."""
+        info = self.info
+        return {
+            "path": self.path,
+            "state": self.state,
+            "format": info.format if info else "",
+            "size_bytes": info.size_bytes if info else 0,
+            "crs": info.crs if info else None,
+            "contents": list(info.contents) if info else [],
+            "notes": list(info.notes) if info else [],
+            "scans": self.scans,
+            "points": self.points,
+            "dropped": self.dropped,
+            "reason": self.reason,
+        }
 
 
 def log_options(
@@ -101,7 +123,10 @@ def _examine(path: str, options: dict[str, Any]) -> Source:
         spans = tuple(source.spans(POINTS_PER_TASK))
     except (SourceError, OSError) as error:
         return replace(known, reason=str(error))
-    return replace(known, info=info, spans=spans)
+    scans = ""
+    if isinstance(source, DriveSource):
+        scans = packed(source.log.stamps_ns[source.used], source.log.point_counts[source.used])
+    return replace(known, info=info, spans=spans, scans=scans)
 
 
 def within(found: Sequence[Source], memory: int) -> list[Source]:
