@@ -68,12 +68,14 @@ def test_a_note_that_sources_share_is_told_once() -> None:
     ]
     many = {f"{n}.las": [f"{n} points lost"] for n in range(1, 6)}
     (one,) = shared(many)
-    assert str(one) == "1.las, 2.las and 3 more: 1 points lost (likewise the others)"
+    (alone,) = shared({"a": [f"{n} lost" for n in range(9)]})
+    assert str(alone) == "a: 0 lost (and 8 with other numbers)"
+    assert str(one) == "1.las, 2.las and 3 more: 1 points lost (and 4 with other numbers)"
 
 
 @given(
     st.dictionaries(
-        st.text("ab", min_size=1, max_size=2), st.lists(st.sampled_from(["p 1", "p 2", "q"]))
+        st.text("ab", min_size=1, max_size=2), st.lists(st.sampled_from(["p 1", "p 2", "p 3", "q"]))
     )
 )
 def test_no_source_with_a_note_is_lost(notes: dict[str, list[str]]) -> None:
@@ -83,8 +85,8 @@ def test_no_source_with_a_note_is_lost(notes: dict[str, list[str]]) -> None:
     told = shared(known)
     for source, texts in known.items():
         mine = [note for note in told if source in note.sources]
-        assert {n.text for n in mine if not n.alike} <= set(texts)
-        assert any(n.alike for n in mine) or {n.text for n in mine} == set(texts)
+        assert {n.text for n in mine if not n.others} <= set(texts)
+        assert any(n.others for n in mine) or {n.text for n in mine} == set(texts)
 
 
 # --- How much of a drive was measured

@@ -16,6 +16,9 @@ import tilestream as ts
 from tilestream.cli import run
 from tilestream.errors import TileNotReadyError, UsageError
 from tilestream.formats.logs import open_log
+from tilestream.formats.routes import route_of
+from tilestream.grid import Box, TileGrid
+from tilestream.pipeline.jobs.along_routes import REACH, off_map
 from tilestream.pipeline.jobs.forecast import forecast
 from tilestream.pipeline.jobs.overlap import overlap, packed, unpacked
 from tilestream.pipeline.jobs.run_settings import RunSettings
@@ -172,5 +175,23 @@ def test_a_route_that_is_not_where_its_map_is(store: str, tmp_path: Path, capsys
         assert "x -50 to 50" in said
         assert "another CRS" in said
     assert not list((tmp_path / "out").rglob("*.parquet"))
-    assert run(["factors", store, *far, *near, *out]) == 1
-    assert "3 sample points" in capsys.readouterr().err  # of the far one; the near one has factors
+    assert run(["factors", store, *far, *near, *out, "--json"]) == 1
+    told = capsys.readouterr()
+    assert "3 sample points" in told.err  # of the far one; the near one has factors
+    (note,) = json.loads(told.out)["notes"]["routes"]
+    assert "within 250 m of far (x 9000 to 9020, y 0 to 0 m):" in note
+
+
+@given(st.floats(-2000.0, 2000.0), st.floats(-2000.0, 2000.0), st.sampled_from([20.0, 50.0, 100.0]))
+def test_a_route_in_reach_of_a_map_is_not_far_from_it(x: float, y: float, tile: float) -> None:
+    """Tiles from 0 to 100 m; a tile of slack at both ends."""
+    grid = TileGrid.of(tile, 10.0)
+    keys = grid.keys_over(Box(0, 0, 100_000, 100_000))
+    route = route_of("a", np.array([[x, y, 0.0], [x + 30.0, y, 0.0]]))
+    away = max(-x - 30.0, x - 100.0, -y, y - 100.0)
+    far = bool(off_map(keys, grid, [route]))
+    if away < REACH:
+        assert not far
+    if away > REACH + 2.0 * tile:
+        assert far
+    assert off_map([], grid, [route]) == []

@@ -18,8 +18,8 @@ class Shared(NamedTuple):
     sources: tuple[str, ...]
     text: str
     """Of the first of them."""
-    alike: bool
-    """Whether the others have other numbers."""
+    others: int = 0
+    """So many other notes differ from this one in their numbers only."""
 
     @property
     def of(self) -> str:
@@ -28,9 +28,14 @@ class Shared(NamedTuple):
         named = ", ".join(self.sources[:NAMED])
         return f"{named} and {more:,} more" if more > 0 else named
 
+    @property
+    def told(self) -> str:
+        """The note, and how many are like it."""
+        return self.text + (f" (and {self.others:,} with other numbers)" if self.others else "")
+
     def __str__(self) -> str:
         """The note with its sources, on a line."""
-        return f"{self.of}: {self.text}" + (" (likewise the others)" if self.alike else "")
+        return f"{self.of}: {self.told}"
 
 
 def noticed(*parts: Notes) -> dict[str, list[str]]:
@@ -45,7 +50,7 @@ def noticed(*parts: Notes) -> dict[str, list[str]]:
 def shared(notes: Notes) -> list[Shared]:
     """The notes, each with all sources that have it, in the order of the first of them.
 
-    Notes that differ in their numbers only are one where more than `NAMED` sources have them.
+    Notes that differ in their numbers only are one where there are more than `NAMED` of them.
     """
     alike: dict[str, dict[str, list[str]]] = {}
     for source, texts in notes.items():
@@ -54,8 +59,8 @@ def shared(notes: Notes) -> list[Shared]:
     found = []
     for of_text in alike.values():
         every = tuple(dict.fromkeys(source for sources in of_text.values() for source in sources))
-        if len(of_text) > 1 and len(every) > NAMED:
-            found.append(Shared(every, next(iter(of_text)), alike=True))
+        if len(of_text) > NAMED:
+            found.append(Shared(every, next(iter(of_text)), len(of_text) - 1))
         else:
-            found += [Shared(tuple(sources), text, False) for text, sources in of_text.items()]
+            found += [Shared(tuple(sources), text) for text, sources in of_text.items()]
     return found

@@ -10,6 +10,7 @@ from tilestream.cli.printing import say_notes
 from tilestream.errors import PartialError, UsageError
 from tilestream.formats.routes import RoutesRead, read_all_routes, together
 from tilestream.notes import noticed
+from tilestream.pipeline.jobs.along_routes import off_map
 from tilestream.pipeline.jobs.sources import map_notes
 from tilestream.store import TileStore
 
@@ -52,7 +53,9 @@ def routes_of(
     map_crs = store.settings.crs
     read = together(read_all_routes(path, project_to=project_to, map_crs=map_crs) for path in files)
     read = read.at_least(spacing)
-    notes = noticed(map_notes(store), read.notes_of(files))
+    known = () if store.manifest is None else store.manifest.identities
+    far = {"routes": off_map(known, store.grid, read.routes)}
+    notes = noticed(map_notes(store), read.notes_of(files), far)
     say_notes(notes)
     try:
         yield read, notes

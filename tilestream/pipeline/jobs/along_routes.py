@@ -12,7 +12,7 @@ from tilestream.crs import require_same
 from tilestream.errors import PartialError, TileNotReadyError
 from tilestream.factors.catalogue import Which
 from tilestream.factors.rows import Samples, in_route_order, samples_by_tile
-from tilestream.grid import TileKey, whole_mm
+from tilestream.grid import MM_PER_M, TileGrid, TileKey, whole_mm
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, paths_of
 from tilestream.pipeline.engine.stage import Stage
@@ -28,6 +28,8 @@ from tilestream.tables import read_tables
 
 REACH = 250.0
 """How far from a map a route is refused [m]: nothing of the map is in view of any lidar there."""
+TOLD = 5
+"""So many routes that are far from a map are named."""
 SENSOR_HEIGHT = 2.0
 """Height of the lidar above the road [m] (the paper's vehicle)."""
 
@@ -103,23 +105,50 @@ def samples_along(
     return samples_by_tile(store.grid, routes, spacing)
 
 
-def require_near(map_plan: MapPlan, samples: Mapping[TileKey, Samples]) -> None:
-    """Refuse routes of which none comes near a map, before any work.
+def off_map(keys: Iterable[TileKey], grid: TileGrid, routes: Iterable[Route]) -> list[str]:
+    """A note on the routes that do not come within `REACH` of a map; none: all do.
 
     Args:
-        map_plan: the map.
+        keys: the tiles of the map; none: it is not known yet where it lies.
+        grid: their grid.
+        routes: in the map's frame.
+    """
+    have, found = list(keys), []
+    for route in routes if have else ():
+        length, size = route.arc_length[-1], grid.tile_mm / MM_PER_M
+        at = np.append(np.arange(0.0, length, size), length)
+        x, y = (np.interp(at, route.arc_length, route.positions[:, axis]) for axis in (0, 1))
+        wanted = [grid.key_at(*place) for place in zip(x.tolist(), y.tolist(), strict=True)]
+        if not _near(have, wanted, grid):
+            places = f"x {x.min():.0f} to {x.max():.0f}, y {y.min():.0f} to {y.max():.0f} m"
+            found.append(f"{route.route_id} ({places})")
+    if not found:
+        return []
+    more = f" and {len(found) - TOLD} more" if len(found) > TOLD else ""
+    told = f"no tile of the map is within {REACH:g} m of {', '.join(found[:TOLD])}{more}"
+    return [f"{told}: nothing is known there"]
+
+
+def require_near(map_plan: MapPlan, samples: Mapping[TileKey, Samples]) -> None:
+    """Refuse routes of which none comes within `REACH` of a map, before any work.
+
+    Args:
+        map_plan: the map; one without tiles is not known yet.
         samples: the sample points by tile.
 
     Raises:
         TileNotReadyError: where both are, and what to do.
     """
-    have, wanted = (np.array(list(keys)).reshape(-1, 2) for keys in (map_plan.points, samples))
-    if not len(have) or not len(wanted):  # of a map that is not read yet
-        return
-    distances = np.asarray(cKDTree(have).query(wanted, p=np.inf)[0])
-    if distances.min() > np.ceil(REACH / map_plan.store.settings.tile_size):
+    have, wanted = list(map_plan.points), list(samples)
+    if have and wanted and not _near(have, wanted, map_plan.store.grid):
         places = np.concatenate([some.places for some in samples.values()])
         raise TileNotReadyError(f"the route {apart(map_plan, places, REACH)}")
+
+
+def _near(have: Sequence[TileKey], wanted: Sequence[TileKey], grid: TileGrid) -> bool:
+    """Whether a tile that is wanted is within `REACH` of one that is there."""
+    distances = np.asarray(cKDTree(np.array(have)).query(np.array(wanted), p=np.inf)[0])
+    return bool(distances.min() <= np.ceil(REACH * MM_PER_M / grid.tile_mm))
 
 
 def plan_factors(

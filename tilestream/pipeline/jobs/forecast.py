@@ -11,6 +11,7 @@ from tilestream.grid import MM_PER_M, Box, TileKey
 from tilestream.notes import Notes, noticed
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.stage import Task
+from tilestream.pipeline.jobs.along_routes import off_map
 from tilestream.pipeline.jobs.ingest import plan_ingest, store_settings
 from tilestream.pipeline.jobs.run_inputs import (
     Inputs,
@@ -69,7 +70,8 @@ def forecast(settings: RunSettings) -> Forecast:
     estimate = plan_estimate(settings, map_plan.store.grid, measure, done)
     of_drives = {drive.log: opened(reading_of(drive)).notes for drive in inputs.drives}
     tasks = (*reading, *measure.tasks, *estimate.tasks)
-    return Forecast(tasks, noticed(notes, inputs.notes, of_drives))
+    far = {"routes": off_map(map_plan.points, map_plan.store.grid, inputs.routes)}
+    return Forecast(tasks, noticed(notes, inputs.notes, far, of_drives))
 
 
 def _simulation_first(settings: RunSettings, wanted: SimulateSettings) -> Forecast:

@@ -10,6 +10,7 @@ from tilestream.errors import SourceError
 from tilestream.model.dataset import Dataset
 from tilestream.notes import noticed
 from tilestream.pipeline.engine.outputs import Parquet
+from tilestream.pipeline.jobs.along_routes import off_map
 from tilestream.pipeline.jobs.drive_measured import drive_measured
 from tilestream.pipeline.jobs.localize import drive_overlap
 from tilestream.pipeline.jobs.run_findings import Done
@@ -36,7 +37,9 @@ def run_notes(settings: RunSettings, inputs: Inputs, store: TileStore) -> dict[s
     """All that was noticed of the inputs of a run whose map is there, by source."""
     of_drives = {drive.log: _notes_of(drive) for drive in inputs.drives}
     own = {JOB: _on_degraded(settings, inputs)}
-    return noticed(inputs.notes, own, map_notes(store), of_drives)
+    known = () if store.manifest is None else store.manifest.identities
+    far = {"routes": off_map(known, store.grid, inputs.routes)}
+    return noticed(inputs.notes, own, far, map_notes(store), of_drives)
 
 
 def with_overlaps(
