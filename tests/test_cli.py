@@ -200,7 +200,7 @@ def test_an_interrupt_is_told_in_one_line(
     def interrupted(_: str) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("tilestream.cli.maps.describe", interrupted)
+    monkeypatch.setattr("tilestream.apps.info.info", interrupted)
     assert run(["info", str(pcd)]) == 130
     told = capsys.readouterr().err.strip()
     assert told == "stopped; the same command continues where it was"
@@ -267,7 +267,7 @@ def test_a_full_disk_is_told_in_one_line(
     def full(_: str) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("tilestream.cli.maps.describe", full)
+    monkeypatch.setattr("tilestream.apps.info.info", full)
     told = "error: [Errno 28] No space left on device: make room; the same command continues"
     assert fails(["info", str(pcd)], 1, capsys) == f"{told} where it was"
 
