@@ -21,16 +21,14 @@ from tilestream.pipeline.jobs.run_inputs import (
     inputs_of,
     is_simulated,
     map_scans,
-    reading_of,
     simulated_folder,
     simulations,
 )
-from tilestream.pipeline.jobs.run_notes import with_overlaps
+from tilestream.pipeline.jobs.run_notes import with_logs
 from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
 from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.jobs.simulate import plan_simulation
 from tilestream.pipeline.jobs.sources import map_notes
-from tilestream.pipeline.stages.drive_scans import opened
 from tilestream.pipeline.stages.map_plan import MapPlan, TilePoints
 from tilestream.pipeline.stages.scatter import SourceSpan
 from tilestream.settings import SimulateSettings
@@ -64,14 +62,13 @@ def forecast(settings: RunSettings) -> Forecast:
         return _simulation_first(settings, settings.simulate)
     inputs = inputs_of(settings, None, None)
     map_plan, reading, notes, sources = _expected_map(settings, inputs)
-    inputs = with_overlaps(settings, inputs, sources)
+    inputs = with_logs(settings, inputs, sources)
     measure = plan_measure(settings, inputs, map_plan)
     done = [Outcome(task.key, task.stage) for task in measure.tasks]
     estimate = plan_estimate(settings, map_plan.store.grid, measure, done)
-    of_drives = {drive.log: opened(reading_of(drive)).notes for drive in inputs.drives}
     tasks = (*reading, *measure.tasks, *estimate.tasks)
     far = {"routes": off_map(map_plan.points, map_plan.store.grid, inputs.routes)}
-    return Forecast(tasks, noticed(notes, inputs.notes, far, of_drives))
+    return Forecast(tasks, noticed(notes, inputs.notes, far))
 
 
 def _simulation_first(settings: RunSettings, wanted: SimulateSettings) -> Forecast:

@@ -49,7 +49,7 @@ from tilestream.pipeline.jobs.run_notes import (
     drives_measured,
     lost_labels,
     run_notes,
-    with_overlaps,
+    with_logs,
 )
 from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
 from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
@@ -114,9 +114,9 @@ def _run(settings: RunSettings, client: Any | None, watch: Watch | None) -> Path
         with report_kept(client, settings.folder / "dask-performance.html"):
             inputs = inputs_of(settings, client, watch)
             book.failures |= inputs.failures
-            book.facts["notes"] = dict(inputs.notes)
             story = _Story(settings, inputs, book)
             inputs = story.inputs
+            book.facts["notes"] = dict(inputs.notes)
             execute(story.first(), client, book.listening(watch), grow=story.grown)
             if story.estimate is None:
                 story.estimate = story.plan_estimate()
@@ -174,7 +174,7 @@ class _Story:
         )
         found = self.reading.found if self.reading else None
         sources = self.store.sources() if found is None else [source.record for source in found]
-        self.inputs = with_overlaps(settings, inputs, sources)
+        self.inputs = with_logs(settings, inputs, sources)
         self.measure = Plan((), settings.memory)
         self.estimate: Plan | None = None
         """None: not planned yet, or to be grown by all workers together."""
@@ -270,7 +270,7 @@ def _report(settings: RunSettings, inputs: Inputs, story: _Story, book: Book) ->
     """Gather what is done and write the report; without a single factor table there is none."""
     good = {outcome.key for outcome in book.outcomes if outcome.ok}
     done = Done(tuple(task for task in book.tasks if task.key in good))
-    measured = drives_measured(settings, inputs, done)
+    measured = drives_measured(inputs, done)
     book.facts["drives"] = [drive.plain() for drive in measured]
     if not done.outputs("factors"):
         return

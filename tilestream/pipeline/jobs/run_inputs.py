@@ -22,6 +22,7 @@ from tilestream.pipeline.stages.drive_scans import Reading as DriveReading
 from tilestream.pipeline.stages.observe import Observing
 from tilestream.pipeline.stages.samples import COLUMNS
 from tilestream.records import Route
+from tilestream.report.drives import DriveMeasured
 from tilestream.sensor import Sensor
 from tilestream.settings import (
     DriveSettings,
@@ -52,6 +53,8 @@ class Inputs:
     """What a reader of the results must know, by source."""
     failures: Mapping[str, str] = field(default_factory=dict)
     """Which routes are left out, and why."""
+    to_measure: tuple[DriveMeasured, ...] = ()
+    """The scans of each drive, as soon as its log is opened."""
     attributions: tuple[str, ...] = ()
     """Whose data it is."""
 

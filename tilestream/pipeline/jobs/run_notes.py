@@ -6,12 +6,11 @@ from typing import Any
 
 import pandas as pd
 
-from tilestream.errors import SourceError
 from tilestream.model.dataset import Dataset
 from tilestream.notes import noticed
 from tilestream.pipeline.engine.outputs import Parquet
 from tilestream.pipeline.jobs.along_routes import off_map
-from tilestream.pipeline.jobs.drive_measured import drive_measured
+from tilestream.pipeline.jobs.drive_measured import to_measure, with_labels
 from tilestream.pipeline.jobs.localize import drive_overlap
 from tilestream.pipeline.jobs.run_findings import Done
 from tilestream.pipeline.jobs.run_inputs import (
@@ -26,46 +25,45 @@ from tilestream.pipeline.jobs.sources import map_notes
 from tilestream.pipeline.stages.drive_scans import opened
 from tilestream.pipeline.stages.label import label
 from tilestream.report.drives import DriveMeasured
-from tilestream.settings import DriveSettings
 from tilestream.store import TileStore
 
 NO_ROWS = pd.DataFrame({"status": [], "reason": []})
 """Where a drive has no labels."""
 
 
-def run_notes(settings: RunSettings, inputs: Inputs, store: TileStore) -> dict[str, list[str]]:
-    """All that was noticed of the inputs of a run whose map is there, by source."""
-    of_drives = {drive.log: _notes_of(drive) for drive in inputs.drives}
-    own = {JOB: _on_degraded(settings, inputs)}
-    known = () if store.manifest is None else store.manifest.identities
-    far = {"routes": off_map(known, store.grid, inputs.routes)}
-    return noticed(inputs.notes, own, far, map_notes(store), of_drives)
-
-
-def with_overlaps(
+def with_logs(
     settings: RunSettings, inputs: Inputs, sources: Sequence[Mapping[str, Any]]
 ) -> Inputs:
-    """The files of a job, with notes on what its drives share with the sources of its map, as a
-    store records these.
+    """The files of a job with what the logs of its drives tell, each opened once: notes, also on
+    what they share with the sources of the map, and which scans are to be measured.
+
+    Args:
+        settings: the job.
+        inputs: its files.
+        sources: what the map is made of, as a store records it.
 
     Raises:
         UsageError: scans that are to be localized are in the map, and not `allow_overlap`.
         SourceError: a log that cannot be read.
     """
-    notes: dict[str, list[str]] = {}
+    notes: list[dict[str, list[str]]] = []
+    found = []
     for drive in inputs.drives:
-        shared = drive_overlap(reading_of(drive), scans_of(drive), settings.spacing, sources)
+        reading, scans, spacing = reading_of(drive), scans_of(drive), settings.spacing
+        log, shared = opened(reading), drive_overlap(reading, scans, spacing, sources)
         if not settings.label.allow_overlap:
             shared.require_none()
-        notes.setdefault(drive.log, []).extend(shared.notes)
-    return replace(inputs, notes=noticed(inputs.notes, notes))
+        notes.append({drive.log: [*log.notes, *shared.notes]})
+        found.append(to_measure(drive.group, log, scans, spacing))
+    return replace(inputs, notes=noticed(inputs.notes, *notes), to_measure=tuple(found))
 
 
-def _notes_of(drive: DriveSettings) -> list[str]:
-    try:
-        return list(opened(reading_of(drive)).notes)
-    except (SourceError, OSError) as error:  # its tasks have failed for that, and are listed
-        return [f"cannot be read any more: {error}"]
+def run_notes(settings: RunSettings, inputs: Inputs, store: TileStore) -> dict[str, list[str]]:
+    """All that was noticed of the inputs of a run whose map is there, by source."""
+    own = {JOB: _on_degraded(settings, inputs)}
+    known = () if store.manifest is None else store.manifest.identities
+    far = {"routes": off_map(known, store.grid, inputs.routes)}
+    return noticed(inputs.notes, own, far, map_notes(store))
 
 
 def _on_degraded(settings: RunSettings, inputs: Inputs) -> list[str]:
@@ -78,22 +76,17 @@ def _on_degraded(settings: RunSettings, inputs: Inputs) -> list[str]:
     return [f"{told}; the estimates along the routes are for the vehicle as it is"]
 
 
-def drives_measured(settings: RunSettings, inputs: Inputs, done: Done) -> tuple[DriveMeasured, ...]:
-    """How much of each drive was measured; a log that is gone is left out."""
+def drives_measured(inputs: Inputs, done: Done) -> tuple[DriveMeasured, ...]:
+    """How much of each drive was measured."""
     tables: dict[str, list[pd.DataFrame]] = {}
     for task in done.outputs(label.name):
         assert isinstance(task.writes, Parquet)
         group = task.writes.path.rsplit("/", 2)[1]
         tables.setdefault(group, []).append(task.writes.read().rows)
-    found = []
-    for drive in inputs.drives:
-        try:
-            log = opened(reading_of(drive))
-        except (SourceError, OSError):
-            continue
-        rows = pd.concat(tables.get(drive.group, [NO_ROWS]), ignore_index=True)
-        found.append(drive_measured(drive.group, log, scans_of(drive), settings.spacing, rows))
-    return tuple(found)
+    return tuple(
+        with_labels(drive, pd.concat(tables.get(drive.drive, [NO_ROWS]), ignore_index=True))
+        for drive in inputs.to_measure
+    )
 
 
 def lost_labels(dataset: Dataset | None) -> list[dict[str, Any]]:
