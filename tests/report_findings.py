@@ -12,6 +12,7 @@ import pytest
 from tilestream.model.registry import REGRESSORS
 from tilestream.records import Float64
 from tilestream.report import Findings, write_report
+from tilestream.report.drives import DriveMeasured
 from tilestream.report.evaluation import OPPONENTS
 
 ORIGIN = (368_000.0, 3_950_000.0, 40.0)
@@ -189,9 +190,11 @@ def whole(seed: int = 0) -> Findings:
             "seconds": 12.5,
             "lost": {},
             "nothing": float("inf"),
-            "notes": ["The preset is not calibrated."],
             "attributions": ["Buildings: somebody."],
         },
+        notes={"job": ["the preset is not calibrated"]},
+        drives=(DriveMeasured("morning", 500, 500, 480, 480, 480, {"after the last pose": 20}),),
+        lost_labels=[{"reason": "label failed", "count": 3, "detail": "nothing near"}],
         crs="EPSG:32654",
         around=cloud_around,
     )
@@ -229,7 +232,10 @@ def hostile() -> Findings:
         criterion_importances=found.criterion_importances.assign(criterion=HOSTILE),
         coverage=found.coverage.replace({"path": {"I": HOSTILE}}),
         around=None,
-        facts={HOSTILE: {HOSTILE: HOSTILE}, "notes": [HOSTILE], "attributions": [HOSTILE]},
+        facts={HOSTILE: {HOSTILE: HOSTILE}, "attributions": [HOSTILE]},
+        notes={HOSTILE: [HOSTILE]},
+        drives=(DriveMeasured(HOSTILE, 9, 9, 2, 2, 2, {HOSTILE: 7}),),
+        lost_labels=[{"reason": HOSTILE, "count": 3, "detail": HOSTILE}],
     )
 
 

@@ -195,7 +195,7 @@ def test_the_map_s_own_projector_serves_its_lanes(
     assert run(["factors", store.url, *asked]) == 0
     told = json.loads(capsys.readouterr().out)
     assert (told["sample_points"], told["done"]) == (31, 31)
-    (note,) = told["notes"]
+    (note,) = told["notes"][str(lanes)]
     assert "brought from degrees" in note
     assert planned(folder, tmp_path) == 0
     assert "1 lanes of" in " ".join(capsys.readouterr().out.split())
@@ -243,7 +243,8 @@ def test_a_route_in_another_zone_is_projected(
     np.testing.assert_allclose(route.positions[:, :2], expected, atol=1e-6)
     assert route.crs == "EPSG:6677"
     assert "projected from EPSG:6676" in read_all_routes(file, map_crs="EPSG:6677").notes[0]
-    store = ts.ingest(cases / "street.pcd", tmp_path / "map.zarr", crs="EPSG:6677")
+    write_pcd(tmp_path / "road.pcd", route.positions)
+    store = ts.ingest(tmp_path / "road.pcd", tmp_path / "map.zarr", crs="EPSG:6677")
     with pytest.raises(CrsError, match=r"EPSG:6676 and .*EPSG:6677"):
         ts.factors_along(store, [alone], tmp_path / "run")
     code = run(

@@ -92,7 +92,7 @@ def test_factors_along_routes_of_one_name(
     assert run(["factors", street, "--route", str(path), *out]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["done"] == 15 + 17
-    assert "2 routes are named Main Street" in facts["notes"][0]
+    assert "2 routes are named Main Street" in facts["notes"][str(path)][0]
 
 
 def test_a_comparison_along_the_good_ones(
@@ -118,7 +118,7 @@ def test_a_job_along_the_good_ones_lists_the_bad_one(cases: Path, tmp_path: Path
     told = json.loads((tmp_path / "run" / "run.json").read_text())
     assert told["state"] == "failed"
     assert list(told["failures"]) == ["route tiny"]
-    assert any("route tiny is left out" in note for note in told["notes"])
+    assert any("route tiny is left out" in note for note in told["notes"]["routes"])
     assert "route tiny is left out" in (tmp_path / "run" / "report" / "index.html").read_text()
 
 

@@ -200,7 +200,7 @@ def test_an_interrupt_is_told_in_one_line(
     def interrupted(_: str) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("tilestream.cli.maps.describe", interrupted)
+    monkeypatch.setattr("tilestream.apps.info.info", interrupted)
     assert run(["info", str(pcd)]) == 130
     told = capsys.readouterr().err.strip()
     assert told == "stopped; the same command continues where it was"
@@ -267,7 +267,7 @@ def test_a_full_disk_is_told_in_one_line(
     def full(_: str) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("tilestream.cli.maps.describe", full)
+    monkeypatch.setattr("tilestream.apps.info.info", full)
     told = "error: [Errno 28] No space left on device: make room; the same command continues"
     assert fails(["info", str(pcd)], 1, capsys) == f"{told} where it was"
 
@@ -308,16 +308,14 @@ def test_names_of_files_do_not_steer_the_terminal(
     assert "[red]:car:" in told.replace("\n", "")
 
 
-def test_names_in_log_lines_and_names_that_are_no_text_are_shown(
-    store: str, tmp_path: Path
-) -> None:
+def test_names_in_log_lines_and_names_that_are_no_text_are_shown(tmp_path: Path) -> None:
     program = [sys.executable, "-m", "tilestream"]
     how = {"cwd": tmp_path, "capture_output": True}
     (tmp_path / "\udcff.mcap").write_bytes(b"none")
     told = subprocess.run([*program, "info", b"\xff.mcap"], **how)
     assert told.stderr.startswith(b"error: \\xff.mcap: ")
-    where = ["--out", "run", "--scheduler", f"tcp://{EVIL}:1"]
-    told = subprocess.run([*program, "localize", store, "\udcff.mcap", *where], **how)
+    where = ["--store", "map.zarr", "--scheduler", f"tcp://{EVIL}:1"]
+    told = subprocess.run([*program, "ingest", "\udcff.mcap", *where], **how)
     assert f"connecting to tcp://{SEEN}" in told.stderr.decode()
     assert b"Traceback" not in told.stderr
     assert not set(b"\x1b\x07") & set(told.stderr)

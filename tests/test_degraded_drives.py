@@ -97,7 +97,7 @@ def test_its_labels_are_joined_with_that_and_the_estimate_is_of_the_vehicle(
     vehicle = averaged_along(usual).set_index(KEYS)["vd_mean"] + OFFSET
     np.testing.assert_array_equal(places["estimate"], vehicle[places.index])
     report = json.loads((run.folder / "report" / "report.json").read_text())
-    assert any("read as: short;" in note for note in report["facts"]["notes"])
+    assert any("read as: short;" in note for note in report["notes"]["job"])
 
 
 @pytest.mark.parametrize("offset", [OFFSET, None])

@@ -41,7 +41,7 @@ def test_each_scan_has_its_pose(tmp_path: Path) -> None:
     assert [(s.start, s.stop) for s in open_source(path).spans(10)] == [
         (0, 200), (200, 400), (400, 600)
     ]  # fmt: skip
-    assert open_source(path).info().notes[0] == "scan 0 'Scan 0': 200 points"
+    assert open_source(path).info().contents[0] == "scan 0 'Scan 0': 200 points"
 
 
 def test_invalid_points_are_dropped_and_counted(tmp_path: Path) -> None:

@@ -256,13 +256,13 @@ def test_the_command(
     assert json.loads(capsys.readouterr().out) == {
         "sample_points": 9,
         "done": 9,
-        "notes": [],
+        "notes": {},
     }
     assert run([*command, "--spacing", "6"]) == 0
     assert "feature_count" in capsys.readouterr().out
     assert run([*command, "--sensor", "VLP17"]) == 2
     assert "known are VLP16, HDL64, OS1_128" in capsys.readouterr().err
-    far = route_of("far", np.array([[900.0, 0.0, np.nan], [990.0, 0.0, np.nan]]))
+    far = route_of("far", np.array([[200.0, 0.0, np.nan], [290.0, 0.0, np.nan]]))
     write_geojson_route(tmp_path / "route.geojson", [far])
     assert run([*command, "--spacing", "60"]) == 1
     assert "1 m to raise the sample point from: 2 sample points" in capsys.readouterr().err

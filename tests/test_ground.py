@@ -126,9 +126,9 @@ def test_a_route_with_other_heights_is_told() -> None:
 
 def test_a_lidar_that_is_not_where_the_settings_say_is_told() -> None:
     heights = pd.Series([2.3, np.nan, 2.2, 2.4])
-    assert note_of_drive("x", heights, 2.1) == []
-    assert note_of_drive("x", pd.Series([np.nan]), 2.1) == []
-    (note,) = note_of_drive("x", heights, 1.5)
+    assert note_of_drive(heights, 2.1) == []
+    assert note_of_drive(pd.Series([np.nan]), 2.1) == []
+    (note,) = note_of_drive(heights, 1.5)
     assert "2.3 m" in note
     assert "3 scans" in note
     assert "1.5 m" in note
@@ -145,7 +145,7 @@ def test_a_route_8_m_above_the_map_is_refused(
     told = capsys.readouterr()
     found = json.loads(told.out)
     assert found["failed"] == found["sample_points"] == 21
-    assert any("8.0 m above the ground of the map" in note for note in found["notes"])
+    assert any("8.0 m above the ground of the map" in note for note in found["notes"]["routes"])
     assert "more than 5 m above or below the ground" in told.err
     table = ts.factors_along(
         ts.open_store(store), ts.read_routes(route), tmp_path / "road", route_z="road"

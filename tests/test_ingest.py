@@ -418,6 +418,27 @@ def test_what_is_a_stray_does_not_depend_on_how_a_source_is_read(
     assert whole.sources()[0]["points"] == 1993
 
 
+@pytest.mark.parametrize("gap", [9_000.0, 11_000.0, 14_000.0, 19_000.0, 21_000.0])
+@pytest.mark.parametrize("begins", [0.0, 9_900.0, -3_210.0])
+def test_what_is_a_stray_does_not_depend_on_the_tiles(
+    gap: float, begins: float, tmp_path: Path
+) -> None:
+    """Of tiles that divide 10 km: nothing nearer than that is one, all twice as far away are."""
+    cloud = np.random.default_rng(0).uniform(0.0, 50.0, (2000, 3))
+    cloud[:, 0] += begins
+    cloud[:3, 0] = cloud[:, 0].max() + gap
+    write_pcd(tmp_path / "a.pcd", cloud)
+    left = {
+        ts.ingest(tmp_path / "a.pcd", tmp_path / f"{size:g}.zarr", tile_size=size).sources()[0][
+            "points"
+        ]
+        for size in (20.0, 50.0, 125.0, 1000.0)
+    }
+    assert len(left) == 1
+    if gap < 10_000.0 or gap > 20_000.0:
+        assert left == {2000 if gap < 10_000.0 else 1997}
+
+
 def test_two_crs_are_refused_before_anything_is_written(tmp_path: Path) -> None:
     cloud = np.zeros((10, 3))
     write_las(tmp_path / "a.las", cloud, crs="EPSG:6677")
@@ -455,7 +476,7 @@ def test_what_cannot_be_is_refused_before_anything_is_written(tmp_path: Path) ->
 def test_a_job_that_does_not_fit_its_memory_is_refused_with_advice(clouds: list[Path]) -> None:
     with pytest.raises(PlanError, match="--memory"):
         ingest_map.plan_ingest(clouds, "map.zarr", IngestSettings(), memory=10_000_000)
-    made = ingest_map.plan_ingest(clouds, "map.zarr", IngestSettings())
+    made = ingest_map.plan_ingest(clouds, "map.zarr", IngestSettings()).scatters
     assert list(made.describe()) == [("scatter", 3, made.promised_bytes)]
     assert made.promised_bytes <= plan.DEFAULT_MEMORY
 

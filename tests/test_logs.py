@@ -158,7 +158,7 @@ def test_what_is_in_a_log(name: str, paths: dict[str, Path]) -> None:
     assert [field for field, _ in found.fields] == ["x", "y", "z"]
     assert found.size_bytes > 0
     assert found.resident_bytes >= 200 * 24
-    text = "\n".join(found.notes)
+    text = "\n".join(found.contents)
     assert f"12 scans of {log.points_topic} over 1.1 s" in text
     assert f"12 with a pose from {log.pose_topic}, along 11.0 m" in text
 

@@ -179,7 +179,7 @@ def test_the_run_tells_what_it_did(done: tuple[Path, Told]) -> None:
         "work": 1,
         "core_seconds": 0,
     }
-    assert not any("above the ground of the map" in note for note in told["notes"])
+    assert "above the ground of the map" not in str(told["notes"])
     effective = yaml.safe_load((done[0] / "config.yaml").read_text())
     assert RunSettings(**effective) == RunSettings(**effective | {"spacing": 1.0})
     assert effective["label"]["starts"]["radius"] == 0.4
@@ -749,7 +749,7 @@ def test_without_routes_all_streets_of_the_map_are_estimated(
     changes = elsewhere | {"map": {"sources": [str(autoware)], "tile_size": 50.0}, "routes": []}
     settings = job(inputs, tmp_path / "run", **changes)
     note = f"all streets of the map, 2 lanes of {autoware}/lanelet2_map.osm; 1 shorter than"
-    assert any(note in told for told in forecast(settings).notes)
+    assert any(note in told for told in forecast(settings).notes["job"])
     with pytest.raises(UsageError, match=r"all 3 lanes of .* shorter than the spacing, 50 m"):
         forecast(settings.model_copy(update={"spacing": 50.0}))
     ts.run(settings)
@@ -848,6 +848,7 @@ def test_a_gate_does_not_open_on_places_that_nobody_estimated(
     estimate = [0.1] * 90 + [None] * 10
     places = pd.DataFrame({"route_id": "a", "arc_length": range(100), "estimate": estimate})
     places.to_parquet(tmp_path / "report" / "places.parquet")
+    (tmp_path / "report" / "report.json").write_text(json.dumps({"drives": []}))
     with pytest.raises(LimitError, match="10 of 100 sample points have no estimate"):
         require_within(tmp_path, 0.25)
     places.iloc[:92].to_parquet(tmp_path / "report" / "places.parquet")
@@ -855,15 +856,18 @@ def test_a_gate_does_not_open_on_places_that_nobody_estimated(
     assert "2 of 92 sample points have no estimate" in capsys.readouterr().err
 
 
-def test_labels_that_are_lost_are_told_in_a_line(tmp_path: Path) -> None:
-    told = {"labelled": 60, "lost_labels": {"label failed": 1, "no sample point near": 20}}
-    (tmp_path / "run.json").write_text(json.dumps(told))
-    (line,) = lost_labels(tmp_path)
-    assert line == (
-        "21 of 81 measured places are not used: 20 no sample point near, 1 label failed"
-    )
-    (tmp_path / "run.json").write_text(json.dumps(told | {"lost_labels": {}}))
-    assert lost_labels(tmp_path) == []
+def test_labels_that_are_lost_are_told_with_their_reasons() -> None:
+    lost = [
+        {"reason": "no sample point near", "count": 20, "detail": "8 m away"},
+        {"reason": "label failed", "count": 1, "detail": ""},
+    ]
+    report = {"headline": {"labelled": 60}, "lost_labels": lost}
+    assert lost_labels(report) == [
+        "21 of 81 measured places are not used:",
+        "  20 no sample point near: 8 m away",
+        "  1 label failed",
+    ]
+    assert lost_labels(report | {"lost_labels": []}) == []
 
 
 def test_the_plan_tells_stages_memory_and_cost(
@@ -883,7 +887,7 @@ def test_a_plan_before_anything_is_there_reads_headers_only(inputs: Path, tmp_pa
     expected = forecast(job(inputs, tmp_path / "run"))
     assert {"scatter", "cells", "terms", "factors", "register"} <= {t.stage for t in expected.tasks}
     assert not (tmp_path / "run").exists()
-    assert any("bounds" in note or "where the points" in note for note in expected.notes)
+    assert any("bounds" in n or "where the points" in n for n in expected.notes["plan"])
 
 
 def test_a_city_that_is_not_simulated_yet_is_planned_first(tmp_path: Path) -> None:

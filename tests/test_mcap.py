@@ -99,7 +99,7 @@ def test_the_real_drive_as_map_points(drive: Path) -> None:
     assert info.points == len(points) == count == 6_317_377
     np.testing.assert_allclose(points.min(0), lowest, atol=1e-9)
     np.testing.assert_allclose(points.max(0), highest, atol=1e-9)
-    text = "\n".join(info.notes)
+    text = "\n".join(info.contents)
     assert "52 scans" in text
     assert "52 with a pose" in text
     assert "71.4 m" in text or "71.5 m" in text
@@ -112,7 +112,7 @@ def test_every_second_scan_maps_and_the_others_localize(drive: Path) -> None:
     assert sorted(np.concatenate(used)) == list(range(52))
     half = open_drive(drive, scans=maps).info()
     assert half.points == log.point_counts[::2].sum()
-    assert "26 scans" in "\n".join(half.notes)
+    assert "26 scans" in "\n".join(half.contents)
 
 
 def test_a_slice_reads_only_its_chunks(drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -135,4 +135,4 @@ def test_a_drive_of_fewer_lidars_than_the_vehicle_is_said_to_be(tmp_path: Path) 
         drives = [{"log": drive, "points_topic": topic}]
         lidars = [{"name": "VLP16", "mount": {"x": float(i)}} for i in range(sensors)]
         job = ts.RunSettings(**values, drives=drives, sensor=lidars)
-        assert len(inputs_of(job, None, None).notes) == notes
+        assert len(inputs_of(job, None, None).notes.get("job", [])) == notes

@@ -304,6 +304,8 @@ class LabelSettings(Settings):
     """Where registrations start."""
     true_pose: TruePose = "log"
     """The true pose: as the log has it, or refined as the paper does."""
+    allow_overlap: bool = False
+    """Measure also with scans that the map was made of, whose errors are too small."""
 
     @property
     def registration(self) -> RegistrationSettings:

@@ -10,7 +10,9 @@ from scipy.spatial import cKDTree
 from tilestream.crs import require_same
 from tilestream.errors import UsageError
 from tilestream.grid import TileKey
+from tilestream.notes import Notes, noticed
 from tilestream.pipeline.jobs.run_folder import map_of, rows_of
+from tilestream.pipeline.jobs.sources import map_notes
 
 SAME_PLACE = 0.5
 """Sample points this near to each other are compared [m]: half their spacing."""
@@ -35,6 +37,8 @@ class MapDiff:
     `before`, `after`, `change` [m]."""
     compared: int
     """Sample points with an estimate in both; 0 where one of them has none."""
+    notes: Notes
+    """What was noticed of the sources of both maps, by source."""
 
 
 def diff(
@@ -69,6 +73,7 @@ def diff(
         sum(had[key] == has[key] for key in both),
         points,
         compared,
+        noticed(map_notes(before), map_notes(after)),
     )
 
 

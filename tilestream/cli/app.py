@@ -39,7 +39,10 @@ COMMANDS = {
         "maps",
         "Read everything that is stored there; list what is damaged, half-made or lost.",
     ),
-    "info": ("maps", "Show what is in a file or log: points, bounds, fields, topics, CRS."),
+    "info": (
+        "maps",
+        "Show what is in anything that is read or made: extent, CRS, coverage, state, notes.",
+    ),
     "localize": (
         "routes",
         "Measure the localization error along a drive: 317 registrations per sample point.",

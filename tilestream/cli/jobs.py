@@ -11,7 +11,7 @@ import typer
 from tilestream.cli.cluster import ALL_CORES, HERE, AllCores, Cluster, on_cluster
 from tilestream.cli.fields import fields, with_settings
 from tilestream.cli.options import AsJson, Changes, Config, DryRun
-from tilestream.cli.printing import err, out, print_json, say
+from tilestream.cli.printing import err, out, print_json, say, say_notes
 from tilestream.cli.progress import progress
 from tilestream.cli.tables import forecast_rows, forecast_table, plan_table, report_table
 from tilestream.errors import LimitError
@@ -22,6 +22,7 @@ from tilestream.pipeline.jobs.run_inputs import extent
 from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
 from tilestream.pipeline.stages.simulated import SCENE_BYTES
 from tilestream.report import cards, gate
+from tilestream.report.drives import EVALUATED, DriveMeasured
 from tilestream.report.segments import MISSING, check_threshold
 from tilestream.settings import SimulateSettings
 from tilestream.simulation.settings import SimulationSettings, load_preset
@@ -41,8 +42,9 @@ def run(
     fail_over: Annotated[
         float | None,
         typer.Option(
-            help="Exit with 1 if any estimate is above this [m], if a route has no estimate at "
-            f"all, or if more than {MISSING:.0%} of the places have none."
+            help="Exit with 1 if any estimate is above this [m], if less than "
+            f"{EVALUATED:.0%} of a drive or of the places of a route were evaluated, or if more "
+            f"than {MISSING:.0%} of all places have no estimate."
         ),
     ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="As `plan`.")] = False,
@@ -81,21 +83,37 @@ def show_report(folder: Path) -> None:
     report = report_of(folder)
     out.print(report_table(report, cards(report)))
     say(f"The matcher is {report['facts']['matcher']['name']}")
-    for line in lost_labels(folder):
+    for line in [*hardly_measured(report), *lost_labels(report)]:
         say(line)
+    say_notes(report["notes"])
     say(f"The report is at {(folder / 'report' / 'index.html').absolute()}")
 
 
-def lost_labels(folder: Path) -> list[str]:
-    """A line on the measured places that no model could learn from, by reason; none: nothing."""
-    run = json.loads((folder / "run.json").read_text())
-    lost: dict[str, int] = run.get("lost_labels", {})
+def hardly_measured(report: dict[str, Any]) -> list[str]:
+    """A line on each drive of which most scans were not measured, and why."""
+    drives = [
+        DriveMeasured(**{name: value for name, value in drive.items() if name != "evaluated"})
+        for drive in report["drives"]
+    ]
+    return [
+        f"{drive.drive}: {drive}" for drive in drives if drive.measured < EVALUATED * drive.scans
+    ]
+
+
+def lost_labels(report: dict[str, Any]) -> list[str]:
+    """A line on the measured places that no model could learn from, and one for each reason; none:
+    nothing.
+    """
+    lost = report["lost_labels"]
     if not lost:
         return []
-    most_first = sorted(lost.items(), key=lambda item: (-item[1], item[0]))
-    reasons = ", ".join(f"{count:,} {reason}" for reason, count in most_first)
-    total = sum(lost.values())
-    return [f"{total:,} of {total + run['labelled']:,} measured places are not used: {reasons}"]
+    total = sum(one["count"] for one in lost)
+    of = total + report["headline"]["labelled"]
+    reasons = [
+        f"  {one['count']:,} {one['reason']}" + (f": {one['detail']}" if one["detail"] else "")
+        for one in lost
+    ]
+    return [f"{total:,} of {of:,} measured places are not used:", *reasons]
 
 
 def require_within(folder: Path, limit: float) -> None:
@@ -108,7 +126,7 @@ def require_within(folder: Path, limit: float) -> None:
     places = pd.read_parquet(folder / "report" / "places.parquet", columns=needed)
     missing = int(places["estimate"].isna().sum())
     say(f"{missing:,} of {len(places):,} sample points have no estimate", to=err)
-    closed = gate(places, limit)
+    closed = gate(places, limit, report_of(folder)["drives"])
     if closed:
         raise LimitError("; ".join(closed))
 
@@ -122,11 +140,10 @@ def plan(
     expected = forecast(read_settings(config, changes))
     rows = forecast_rows(expected)
     if as_json:
-        print_json({"stages": rows, "notes": list(expected.notes)})
+        print_json({"stages": rows, "notes": expected.notes})
         return
     out.print(forecast_table(rows))
-    for note in expected.notes:
-        say(note)
+    say_notes(expected.notes, to=out)
 
 
 @on_cluster

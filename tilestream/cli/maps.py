@@ -1,22 +1,23 @@
 """The commands about maps and files: make a tile store, look into one, compare two."""
 
 from dataclasses import asdict
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from tilestream.apps import diff as map_diff
+from tilestream.apps import info as describing
 from tilestream.apps import verify as verifying
 from tilestream.cli.cluster import HERE, Cluster, on_cluster
 from tilestream.cli.fields import fields, with_settings
 from tilestream.cli.options import AsJson, DryRun, StoreUrl
-from tilestream.cli.printing import out, print_json, say
+from tilestream.cli.printing import out, print_json, say, say_notes
 from tilestream.cli.progress import progress
 from tilestream.cli.tables import TILE_CHANGES, diff_table, info_table, plan_table, tile_table
 from tilestream.errors import PartialError
-from tilestream.formats import describe
 from tilestream.pipeline.jobs import ingest as ingest_map
 from tilestream.pipeline.jobs.run_inputs import ingest_settings, scans_of
+from tilestream.pipeline.jobs.sources import map_notes
 from tilestream.settings import IngestSettings, LogOptions, LogSettings, MapSettings, PlaceSettings
 from tilestream.store import POINTS, TileStore, open_store
 
@@ -31,13 +32,15 @@ def ingest(
     how: Annotated[MapSettings, fields(*IngestSettings.model_fields, *LogSettings.model_fields)],
     limits: Annotated[PlaceSettings, fields("memory")],
     dry_run: DryRun = False,
+    as_json: AsJson = False,
     cluster: Cluster = HERE,
 ) -> None:
     """Make a tile store from point clouds, map directories and logs of drives."""
     settings, scans, allowed = ingest_settings(how), scans_of(how), limits.memory
     if dry_run:
-        plan = ingest_map.plan_ingest(sources, store, settings, allowed, how.log_options, scans)
-        out.print(plan_table(plan))
+        planned = ingest_map.plan_ingest(sources, store, settings, allowed, how.log_options, scans)
+        out.print(plan_table(planned.scatters))
+        say_notes(planned.notes)
         return
     failed: PartialError | None = None
     with cluster.client(allowed) as client, progress() as watch:
@@ -55,8 +58,11 @@ def ingest(
         except PartialError as error:
             failed = error
     made = open_store(store)
-    print_sources(made)
-    out.print(tile_table(made))
+    if as_json:
+        print_json(store_facts(made))
+    else:
+        print_sources(made)
+        out.print(tile_table(made))
     if failed is not None:
         raise failed
 
@@ -73,21 +79,27 @@ def status(
     condition = opened.condition()
     failures |= {} if condition.whole else {opened.url: str(condition)}
     if as_json:
-        print_json(
-            {
-                "url": opened.url,
-                "whole": condition.whole,
-                "condition": str(condition),
-                "settings": asdict(opened.settings),
-                "sources": opened.sources(),
-                "tiles": {str(key): asdict(mark) for key, mark in marks.items()},
-            }
-        )
+        print_json(store_facts(opened))
     else:
         out.print(tile_table(opened))
         say(f"The map is {condition}")
+        say_notes(map_notes(opened))
     if failures:
         raise PartialError(f"{store}: the map is not whole, or parts of it failed:", failures)
+
+
+def store_facts(store: TileStore) -> dict[str, Any]:
+    """A tile store for machines: its state, its tiles, and what was noticed of its sources."""
+    condition = store.condition()
+    return {
+        "url": store.url,
+        "whole": condition.whole,
+        "condition": str(condition),
+        "settings": asdict(store.settings),
+        "sources": store.sources(),
+        "notes": map_notes(store),
+        "tiles": {str(key): asdict(mark) for key, mark in store.marks(POINTS).items()},
+    }
 
 
 def verify(
@@ -129,14 +141,17 @@ def _why_left(damage: verifying.Damage) -> str:
 
 @with_settings
 def info(
-    file: Annotated[str, typer.Argument(help="Any supported file, log or map directory.")],
+    file: Annotated[
+        str,
+        typer.Argument(help="Points, a log, routes, a map folder, a store, a run, or a model."),
+    ],
     log: Annotated[LogOptions, fields(*LogOptions.model_fields)],
     as_json: AsJson = False,
 ) -> None:
-    """Show what is in a file or log: points, bounds, fields, topics, CRS."""
-    found = describe(file, **log.given)
+    """Show what is in anything that is read or made: extent, CRS, coverage, state, notes."""
+    found = describing.info(file, log)
     if as_json:
-        print_json(asdict(found))
+        print_json(found.plain())
     else:
         out.print(info_table(found))
 
@@ -154,15 +169,17 @@ def diff(
     if as_json:
         tiles = {kind: [str(k) for k in getattr(found, kind)] for kind in TILE_CHANGES}
         points = found.worse.to_dict("records")
-        print_json({**tiles, "same": found.same, "compared": found.compared, "worse": points})
+        counts = {"same": found.same, "compared": found.compared, "notes": found.notes}
+        print_json({**tiles, **counts, "worse": points})
     else:
         out.print(diff_table(found))
+        say_notes(found.notes)
 
 
 def print_sources(store: TileStore) -> None:
     """What an ingest read, a line per source."""
     for source in store.sources():
-        dropped = f", {source['dropped']:,} not finite and dropped" if source["dropped"] else ""
-        say(f"{source['path']}: {source['format']}, {source['points']:,} points{dropped}")
-        for note in source["notes"]:
-            say(f"  {note}")
+        say(f"{source['path']}: {source['format']}, {source['points']:,} points")
+        for line in source.get("contents", ()):  # older stores have none
+            say(f"  {line}")
+    say_notes(map_notes(store), to=out)

@@ -6,10 +6,14 @@ from typing import Annotated
 
 import typer
 
-from tilestream.cli.printing import err, say
+from tilestream.cli.printing import say_notes
 from tilestream.errors import PartialError, UsageError
 from tilestream.formats.routes import RoutesRead, read_all_routes, together
+from tilestream.notes import noticed
+from tilestream.pipeline.jobs.along_routes import off_map
+from tilestream.pipeline.jobs.sources import map_notes
 from tilestream.settings import LogOptions
+from tilestream.store import TileStore
 
 StoreUrl = Annotated[str, typer.Argument(help="The tile store.")]
 Routes = Annotated[list[str], typer.Option(help="TUM, KITTI, CSV, GeoJSON, Lanelet2 or a log.")]
@@ -40,25 +44,29 @@ def routes_of(
     files: list[str],
     project_to: str | None,
     spacing: float,
-    map_crs: str | None,
+    store: TileStore,
     log_options: LogOptions,
-) -> Iterator[RoutesRead]:
-    """The routes of all files that can be used, logs read as these options say; notes are printed.
+) -> Iterator[tuple[RoutesRead, dict[str, list[str]]]]:
+    """The routes of all files that can be used, logs read as these options say, and the notes on
+    them and on their map by source, which are printed.
 
     Raises:
         SourceError, UsageError: none of them can be used; says why the first cannot.
         PartialError: when all is done with the good ones, some cannot be used; lists them, with
             what else failed.
     """
+    map_crs = store.settings.crs
     read = together(
         read_all_routes(path, project_to=project_to, map_crs=map_crs, log_options=log_options)
         for path in files
     )
     read = read.at_least(spacing)
-    for note in read.notes:
-        say(note, to=err)
+    known = () if store.manifest is None else store.manifest.identities
+    far = {"routes": off_map(known, store.grid, read.routes)}
+    notes = noticed(map_notes(store), read.notes_of(files), far)
+    say_notes(notes)
     try:
-        yield read
+        yield read, notes
     except PartialError as error:
         raise error.with_more(read.failures) from None
     if read.failures:

@@ -8,6 +8,8 @@ from typing import Any
 from rich.console import Console
 from rich.segment import Segment
 
+from tilestream.notes import Notes, shared
+
 BIDIRECTIONAL = "\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"
 """Characters that change in which order others are shown."""
 SHOWN_AS = {
@@ -50,6 +52,12 @@ err = _Console(stderr=True)
 def say(line: str, to: Console = out) -> None:
     """One line as it is: nothing coloured, no path broken."""
     to.print(line, highlight=False, soft_wrap=True)
+
+
+def say_notes(notes: Notes, to: Console = err) -> None:
+    """What was noticed of sources: a line for each note, with all that share it."""
+    for note in shared(notes):
+        say(f"note: {note}", to=to)
 
 
 def print_json(value: object) -> None:

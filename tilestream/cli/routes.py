@@ -1,5 +1,6 @@
 """The commands along routes and drives: measure errors, compute factors, compare sensors."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,7 +11,7 @@ from tilestream.apps import compare as comparing
 from tilestream.cli.cluster import HERE, Cluster, on_cluster
 from tilestream.cli.fields import fields, with_settings
 from tilestream.cli.options import AsJson, DryRun, Routes, StoreUrl, numbers, routes_of
-from tilestream.cli.printing import err, out, print_json, say
+from tilestream.cli.printing import out, print_json, say, say_notes
 from tilestream.cli.progress import progress
 from tilestream.cli.tables import (
     comparison_table,
@@ -19,15 +20,20 @@ from tilestream.cli.tables import (
     factor_table,
     plan_table,
 )
-from tilestream.errors import PartialError
+from tilestream.errors import LimitError, PartialError
 from tilestream.factors.catalogue import Which
 from tilestream.factors.heights import notes_of_routes
+from tilestream.notes import noticed
 from tilestream.pipeline.jobs import along_routes
 from tilestream.pipeline.jobs import localize as localize_drive
+from tilestream.pipeline.jobs.drive_measured import drive_measured
 from tilestream.pipeline.jobs.run_inputs import reading_of, scans_of
+from tilestream.pipeline.jobs.sources import map_notes
+from tilestream.pipeline.stages.drive_scans import opened as opened_log
 from tilestream.pipeline.stages.factors import Looking
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.report import write_comparison
+from tilestream.report.drives import EVALUATED
 from tilestream.report.segments import check_threshold
 from tilestream.sensor import SENSORS, sensor_of
 from tilestream.settings import (
@@ -63,7 +69,7 @@ def localize(
     folder: Annotated[str, typer.Option("--out", help="Folder of the tables.")],
     which_map: Annotated[MapSettings, fields("partial")],
     places: Annotated[PlaceSettings, fields("cell_size", "spacing", "memory")],
-    labels: Annotated[LabelSettings, fields("matcher", "true_pose")],
+    labels: Annotated[LabelSettings, fields("matcher", "true_pose", "allow_overlap")],
     leaf: Annotated[RegistrationSettings, fields("scan_leaf")],
     starts: Annotated[StartSettings, fields("radius", "step")],
     drive: Annotated[
@@ -93,6 +99,12 @@ def localize(
         "memory": places.memory,
     }
     opened, reading = open_store(store), reading_of(drive)
+    log = opened_log(reading)
+    shared = localize_drive.drive_overlap(reading, how["scans"], places.spacing, opened.sources())
+    notes = noticed(map_notes(opened), {drive.log: [*log.notes, *shared.notes]})
+    say_notes(notes)
+    if not labels.allow_overlap:
+        shared.require_none()
     if dry_run:
         out.print(
             plan_table(
@@ -112,16 +124,25 @@ def localize(
             client=client,
             watch=watch,
             partial=which_map.partial,
+            allow_overlap=labels.allow_overlap,
         )
+    measured = drive_measured(drive.log, log, how["scans"], places.spacing, found)
     if as_json:
-        print_json({"matcher": registration.told, **error_facts(found)})
+        facts = error_facts(found)
+        told = {"matcher": registration.told, "drive": measured.plain(), "notes": notes}
+        print_json({**told, **facts})
     else:
-        out.print(error_table(found, registration.told))
+        out.print(error_table(found, registration.told, measured))
         say(f"The tables are in {folder}/errors and {folder}/starts")
     failed = found[found["status"] != "done"]
     if len(failed):
         reasons = {f"scan {s}": r for s, r in zip(failed["scan"], failed["reason"], strict=True)}
         raise PartialError(f"{drive.log}: {len(failed)} of {len(found)} scans failed:", reasons)
+    if not measured.evaluated:
+        raise LimitError(
+            f"{drive.log}: {measured}: less than {EVALUATED:.0%} of what was selected was "
+            "evaluated; --from-s and --until-s select a part that has poses"
+        )
 
 
 @on_cluster
@@ -145,7 +166,7 @@ def factors(
 ) -> None:
     """Compute the factors of the map at every sample point of a route."""
     opened = open_store(store)
-    with routes_of(route, places.project_to, places.spacing, opened.settings.crs, log) as read:
+    with routes_of(route, places.project_to, places.spacing, opened, log) as (read, notes):
         routes = read.routes
         sensor, height, z = places.looking_sensor, places.sensor_height, places.route_z
         if dry_run:
@@ -172,7 +193,7 @@ def factors(
                 partial=which_map.partial,
             )
         counts = rows["status"].value_counts()
-        notes = [*read.notes, *_heights_told(rows, places)]
+        notes = noticed(notes, _heights_told(rows, places))
         if as_json:
             found = {str(status): int(count) for status, count in counts.items()}
             print_json({"sample_points": len(rows), **found, "notes": notes})
@@ -225,7 +246,7 @@ def compare(
     for limit in (report.threshold, cap):
         check_threshold(limit)
     opened = open_store(store)
-    with routes_of(route, places.project_to, places.spacing, opened.settings.crs, log) as read:
+    with routes_of(route, places.project_to, places.spacing, opened, log) as (read, notes):
         routes = read.routes
         choices = comparing.choices_of(
             [sensor_of(name) for name in sensor],
@@ -266,17 +287,16 @@ def compare(
                 watch=watch,
                 partial=which_map.partial,
             )
-        content = write_comparison(found, folder, threshold=report.threshold, cap=cap)
         first = found.rows[found.rows["choice"] == found.rows["choice"].iloc[0]]
-        notes = [*read.notes, *_heights_told(first, places)]
-        _show_comparison({**content, "notes": notes}, store, folder, as_json)
+        found = replace(found, notes=noticed(notes, _heights_told(first, places)))
+        content = write_comparison(found, folder, threshold=report.threshold, cap=cap)
+        _show_comparison(content, store, folder, as_json)
 
 
-def _heights_told(rows: pd.DataFrame, places: PlaceSettings) -> list[str]:
+def _heights_told(rows: pd.DataFrame, places: PlaceSettings) -> dict[str, list[str]]:
     """What the heights of sample points tell, printed."""
-    notes = notes_of_routes(rows, places.sensor_height, places.route_z)
-    for note in notes:
-        say(note, to=err)
+    notes = {"routes": notes_of_routes(rows, places.sensor_height, places.route_z)}
+    say_notes(notes)
     return notes
 
 

@@ -9,11 +9,13 @@ from rich.box import SIMPLE
 from rich.table import Table
 
 from tilestream.apps.diff import MapDiff
+from tilestream.apps.info import Info
+from tilestream.crs import named
 from tilestream.factors.catalogue import COLUMNS
-from tilestream.formats.base import SourceInfo
 from tilestream.pipeline.engine.costs import core_hours
 from tilestream.pipeline.engine.plan import Plan, megabytes
 from tilestream.pipeline.jobs.forecast import Forecast
+from tilestream.report.drives import DriveMeasured
 from tilestream.store import POINTS, TileStore
 
 
@@ -86,22 +88,51 @@ def forecast_table(rows: list[dict[str, object]]) -> Table:
     return table
 
 
-def info_table(found: SourceInfo) -> Table:
-    """What is in a file, a line per fact."""
+def info_table(found: Info) -> Table:
+    """What is in a file, or in what we have made, a line per fact."""
     table = Table(show_header=False, title=found.path, title_justify="left", box=SIMPLE)
-    table.add_row("format", found.format)
-    table.add_row("size", f"{found.size_bytes:,} bytes")
-    table.add_row(
-        "points", "only reading it tells" if found.points is None else f"{found.points:,}"
-    )
-    if found.bounds:
-        for name, corner in zip(("lowest [m]", "highest [m]"), found.bounds, strict=True):
-            table.add_row(name, "  ".join(f"{value:.3f}" for value in corner))
-    table.add_row("fields", ", ".join(f"{name}: {kind}" for name, kind in found.fields))
-    table.add_row("CRS", found.crs or "none in the file")
+    table.add_row("what", f"{found.kind}: {found.format}")
+    table.add_row("state", found.state)
+    if found.size_bytes is not None:
+        table.add_row("size", f"{found.size_bytes:,} bytes")
+    if found.fields:
+        table.add_row("fields", ", ".join(f"{name}: {kind}" for name, kind in found.fields))
+    if found.kind != "model":
+        table.add_row("CRS", "none is named" if found.crs is None else named(found.crs))
+    for name, frame in found.frames.items():
+        table.add_row(f"frame of {name}", frame or "not named")
+    for name, told in (*_extent(found), *_coverage(found)):
+        table.add_row(name, told)
+    for line in found.contents:
+        table.add_row("holds", line)
     for note in found.notes:
         table.add_row("note", note)
     return table
+
+
+def _extent(found: Info) -> list[tuple[str, str]]:
+    """From where to where it reaches: millimetres, or what they are in degrees."""
+    if found.bounds is None:
+        return []
+    digits = 8 if found.unit == "degrees" else 3
+    lowest, highest = (
+        "  ".join("no z" if math.isnan(value) else f"{value:.{digits}f}" for value in corner)
+        for corner in found.bounds
+    )
+    told = "none" if found.heights is None else "{:.3f} to {:.3f} m".format(*found.heights)
+    unit = f"[{found.unit}]"
+    return [(f"lowest {unit}", lowest), (f"highest {unit}", highest), ("heights", told)]
+
+
+def _coverage(found: Info) -> list[tuple[str, str]]:
+    """How much of it there is."""
+    rows = []
+    if found.points is not None and found.kind != "run":
+        rows.append(("points", f"{found.points:,}"))
+    for name, value in found.coverage.items():
+        shown = f"{value:.1f}" if isinstance(value, float) else str(value)
+        rows.append((name.replace("_", " "), shown))
+    return rows
 
 
 def factor_table(rows: pd.DataFrame) -> Table:
@@ -160,13 +191,15 @@ READ_AS = {
 """Scale, unit and meaning of the facts of a drive, for people."""
 
 
-def error_table(labels: pd.DataFrame, matcher: str) -> Table:
-    """The errors of a drive, figure and meaning, and its worst places."""
+def error_table(labels: pd.DataFrame, matcher: str, drive: DriveMeasured) -> Table:
+    """The errors of a drive, figure and meaning, how much of it they are of, its worst places."""
     table = Table(title="localization error", title_justify="left", box=SIMPLE, show_header=False)
     table.add_column(justify="right", no_wrap=True)
     table.add_column()
     facts = error_facts(labels)
     table.add_row(matcher, "the matcher")
+    why = f"; of the others {drive.why}" if drive.reasons else ""
+    table.add_row(f"{drive.measured:,} of {drive.scans:,}", f"scans measured{why}")
     table.add_row(f"{facts['sample_points']:,}", "sample points")
     table.add_row(f"{facts['failed']:,}", "of them without a measurement")
     for name, (scale, unit, meaning) in READ_AS.items():

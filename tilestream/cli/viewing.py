@@ -9,8 +9,10 @@ from rich.text import Text
 
 from tilestream.apps.scene import MOST_POINTS, Scene, scene_of
 from tilestream.apps.view import require_display, show
-from tilestream.cli.printing import out
+from tilestream.cli.printing import out, say_notes
 from tilestream.grid import TileKey
+from tilestream.pipeline.jobs.run_folder import map_of
+from tilestream.pipeline.jobs.sources import map_notes
 from tilestream.report.colours import STEPS, palette
 
 RAMP = 24
@@ -34,6 +36,7 @@ def view(
     """Show a map in 3D, the route on it coloured by measured or estimated error."""
     key = None if tile is None else TileKey.parse(tile)
     require_display(screenshot)
+    say_notes(map_notes(map_of(place)))
     scene = scene_of(place, tile=key, points=points)
     for line in legend(scene):
         out.print(line, soft_wrap=True, highlight=False)

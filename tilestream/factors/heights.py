@@ -47,11 +47,10 @@ def notes_of_routes(places: pd.DataFrame, sensor_height: float, route_z: RouteZ)
     return notes
 
 
-def note_of_drive(name: str, above_ground: pd.Series, sensor_height: float) -> list[str]:
+def note_of_drive(above_ground: pd.Series, sensor_height: float) -> list[str]:
     """A sentence where the lidar of a drive is not as high above the ground as the settings say.
 
     Args:
-        name: of the drive.
         above_ground: height of the lidar above the ground of the map at each label [m]; NaN: not
             known.
         sensor_height: height of the lidar above the road, as set [m].
@@ -60,7 +59,7 @@ def note_of_drive(name: str, above_ground: pd.Series, sensor_height: float) -> l
     if not len(known) or abs(np.median(known) - sensor_height) <= LIDAR_TOLD_FROM:
         return []
     told = (
-        f"drive {name}: its lidar is {np.median(known):.1f} m above the ground of the map (median "
+        f"its lidar is {np.median(known):.1f} m above the ground of the map (median "
         f"of {len(known)} scans), and sensor_height, which estimates are for, {sensor_height:g} m"
     )
     return [told]

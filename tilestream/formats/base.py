@@ -38,8 +38,10 @@ class SourceInfo:
     resident_bytes: int = 0
     """What a reader must hold at once besides a block [bytes]: 0 where it reads in blocks, the
     size of the decoded content for a format that only opens whole."""
+    contents: tuple[str, ...] = ()
+    """What it is made of, a line each: topics of a log, scans of a survey."""
     notes: tuple[str, ...] = ()
-    """What else a user should know, a line each: topics of a log, what was lost from it, …"""
+    """What a user should know, a line each: what was assumed, chosen, lost or left out."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from tilestream.formats.logs.scan_log import ScanLog, kept
 from tilestream.formats.logs.selection import ScanSelection
 from tilestream.formats.points.rows import steps, whole_span
 from tilestream.formats.registry import Format
-from tilestream.records import Float64
+from tilestream.records import Float64, Int64
 from tilestream.settings import LogOptions
 
 
@@ -35,6 +35,11 @@ class DriveSource:
     def path(self) -> str:
         """The log, as it was named."""
         return self.log.path
+
+    @property
+    def used(self) -> Int64:
+        """(k,) the scans that become map points, by index in the log."""
+        return self._used
 
     def info(self) -> SourceInfo:
         """What is in the drive; `points` counts those of the scans used."""

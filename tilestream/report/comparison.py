@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 
 from tilestream.errors import UsageError
+from tilestream.notes import Notes
 from tilestream.records import Float64
 from tilestream.report.segments import check_threshold, worst_places
 from tilestream.report.summary import by_reason, plain, quantiles
@@ -47,6 +48,8 @@ class Comparison:
     where that fits the tiles."""
     facts: dict[str, Any] = field(default_factory=dict)
     """How it was made: settings by name."""
+    notes: Notes = field(default_factory=dict)
+    """What was noticed of the map and the routes, by source."""
 
     def __post_init__(self) -> None:
         wanted = {"rows": ROW_COLUMNS, "choices": CHOICE_COLUMNS, "cells": CELL_COLUMNS}
@@ -189,6 +192,7 @@ class Comparison:
                     "differing": self.differing(),
                     "cell_sizes": self.cell_sizes(cap),
                     "facts": self.facts,
+                    "notes": self.notes,
                 }
             )
         )

@@ -1,6 +1,6 @@
 """What a report is made of: the tables that a run has made, checked once."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from tilestream.errors import UsageError
 from tilestream.model.registry import DEFAULT
 from tilestream.model.training import PREDICTION_COLUMNS
+from tilestream.notes import Notes
 from tilestream.records import Float64
+from tilestream.report.drives import DriveMeasured
 
 PLACE_COLUMNS = ("route_id", "sample", "arc_length", "heading", "x", "y", "z")
 """Where a sample point is: its route, its number there, and the map frame [m, rad]."""
@@ -64,8 +66,14 @@ class Findings:
     """Which of the models of `protocols` has made the estimates; one that is not among them was
     trained elsewhere."""
     facts: dict[str, Any] = field(default_factory=dict)
-    """Run facts by name; a dictionary among them becomes a table of its own. `notes` and
-    `attributions` are lists of sentences."""
+    """Run facts by name; a dictionary among them becomes a table of its own. `attributions` is a
+    list of sentences."""
+    notes: Notes = field(default_factory=dict)
+    """What was noticed of the inputs, by source."""
+    drives: tuple[DriveMeasured, ...] = ()
+    """How much of each drive was measured."""
+    lost_labels: Sequence[Mapping[str, Any]] = ()
+    """The labels that no model can learn from: `reason`, `count`, `detail`."""
     crs: str | None = None
     """CRS of x and y, anything that pyproj reads; None: a local frame."""
     around: Around | None = None

@@ -12,10 +12,12 @@ from bokeh.resources import Resources
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from tilestream.notes import shared
 from tilestream.report import charts, evaluation, formatting
 from tilestream.report.colours import ACTUAL, CLIP, CRITERION, HELD_OUT, OTHER
 from tilestream.report.comparison import QUANTILE, USUAL, Comparison
 from tilestream.report.data import AROUND, Findings
+from tilestream.report.drives import EVALUATED
 from tilestream.report.pictures import ABOVE, BELOW, heights_ramp
 from tilestream.report.segments import APART, BRIDGE
 from tilestream.report.summary import AXES, STARTS, cards
@@ -118,6 +120,8 @@ def _render(
     scripts = [bokeh, _ENVIRONMENT.get_template("page.js").render()]
     return _ENVIRONMENT.get_template(template).render(
         content=content,
+        noticed=shared(content["notes"]),
+        evaluated_share=EVALUATED,
         charts=items,
         scripts=[Markup(script) for script in scripts],
         policy=_policy(scripts),

@@ -1,6 +1,8 @@
 """What is read off the estimates: lengths, the share over a threshold, segments, worst places."""
 
 import math
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -9,6 +11,7 @@ from numpy.typing import NDArray
 from tilestream.errors import UsageError
 from tilestream.records import Float64, Int64
 from tilestream.report.data import estimates
+from tilestream.report.drives import EVALUATED
 
 WORST = 10
 """How many of the worst places are shown."""
@@ -22,15 +25,17 @@ NAMED = 5
 """Routes that are named where a gate stays closed."""
 
 
-def gate(places: pd.DataFrame, limit: float) -> list[str]:
+def gate(places: pd.DataFrame, limit: float, drives: Sequence[Mapping[str, Any]] = ()) -> list[str]:
     """Why a map does not pass a limit; empty: it passes.
 
-    What is not known does not pass: a route without any estimate fails the gate, and so does a map
-    of which more than `MISSING` of the places have none.
+    What is not known does not pass: a route without any estimate fails the gate, and so does one
+    of whose places less than `EVALUATED` have one, a drive that was not evaluated to that share,
+    and a map of which more than `MISSING` of the places have no estimate.
 
     Args:
         places: route_id, arc_length [m] and estimate [m] of every sample point.
         limit: greatest estimate that passes [m].
+        drives: how much of each drive was measured (`DriveMeasured.plain`).
 
     Raises:
         UsageError: the limit is not positive.
@@ -45,11 +50,21 @@ def gate(places: pd.DataFrame, limit: float) -> list[str]:
             f"{over} of {total} sample points are estimated above {limit:g} m, the worst "
             f"{worst['estimate']:.2f} m on {worst['route_id']} at {worst['arc_length']:.0f} m"
         )
-    known = pd.Series(np.isfinite(estimate)).groupby(places["route_id"].to_numpy(str)).any()
-    blind = known.index[~known].tolist()
+    known = pd.Series(np.isfinite(estimate)).groupby(places["route_id"].to_numpy(str)).mean()
+    blind = known.index[known == 0.0].tolist()
     if blind:
-        more = ", …" if len(blind) > NAMED else ""
-        found.append(f"no estimate at all on {', '.join(blind[:NAMED])}{more}")
+        found.append(f"no estimate at all on {_named(blind)}")
+    hardly = known[(known > 0.0) & (known < EVALUATED)]
+    if len(hardly):
+        told = [f"{route} ({share:.0%})" for route, share in hardly.items()]
+        found.append(f"less than {EVALUATED:.0%} of the places have an estimate on {_named(told)}")
+    unseen = [
+        f"{one['drive']} ({one['measured']:,} of {one['scans']:,} scans)"
+        for one in drives
+        if not one["evaluated"]
+    ]
+    if unseen:
+        found.append(f"less than {EVALUATED:.0%} was measured of drive {_named(unseen)}")
     missing = int(np.isnan(estimate).sum())
     if missing > MISSING * total:
         found.append(
@@ -57,6 +72,10 @@ def gate(places: pd.DataFrame, limit: float) -> list[str]:
             "report/index.html lists why"
         )
     return found
+
+
+def _named(names: Sequence[str]) -> str:
+    return ", ".join(names[:NAMED]) + (", …" if len(names) > NAMED else "")
 
 
 def check_threshold(limit: float) -> None:

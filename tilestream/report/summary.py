@@ -50,6 +50,9 @@ def summary(found: Findings, threshold: float) -> dict[str, Any]:
         "ceilings": found.ceilings,
         "model": found.model,
         "facts": found.facts,
+        "notes": found.notes,
+        "drives": [drive.plain() for drive in found.drives],
+        "lost_labels": found.lost_labels,
     }
     return dict(plain(content))
 
@@ -108,6 +111,10 @@ def cards(content: Mapping[str, Any]) -> list[tuple[str, str]]:
     head, limit = content["headline"], cm(content["threshold"], 0)
     unlike = (percent(head["outside_share"]), "of the places unlike the training places")
     over = f"of the places over {limit}: {distance(head['over_length'])} of road"
+    drives = content["drives"]
+    measured, scans = (sum(drive[name] for drive in drives) for name in ("measured", "scans"))
+    of_drives = (f"{thousands(measured)} of {thousands(scans)}", "scans of the drives measured")
+    evaluated = f"{thousands(head['estimated'])} of {thousands(head['places'])}"
     missing = f"places without an estimate ({percent(head['missing_share'])})"
     return [
         (distance(head["length"]), f"of road, {thousands(head['places'])} sample points"),
@@ -116,6 +123,8 @@ def cards(content: Mapping[str, Any]) -> list[tuple[str, str]]:
         (cm(head["max"]), "the highest estimate"),
         (percent(head["over_share"]), over),
         *([unlike] if known(head["outside_share"]) else []),
+        (evaluated, "places evaluated"),
+        *([of_drives] if drives else []),
         (thousands(head["labelled"]), "measured errors to train on and to judge by"),
         (thousands(head["missing"]), missing),
     ]

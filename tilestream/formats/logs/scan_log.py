@@ -1,8 +1,8 @@
 """The scans of a log with the pose of the lidar at each, whatever the format."""
 
 import math
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,8 @@ from tilestream.formats.logs.drivers import (
     time_offsets,
 )
 from tilestream.formats.logs.poses import PoseStatus, interpolate, jumps
-from tilestream.formats.motion import along
+from tilestream.formats.motion import along, jumped
+from tilestream.kernels.fixed_order import norms
 from tilestream.records import Float64, Int64, Scan
 from tilestream.settings import LogOptions
 
@@ -33,6 +34,15 @@ _BYTES_PER_POINT = 80
 """What the columns of a scan that is read take [bytes per point]."""
 LOOKED_AT = 5
 """So many scans tell how much of a turn they span, and the unit of the points' times."""
+
+
+SKIPPED = {
+    PoseStatus.BEFORE: "before the first pose",
+    PoseStatus.AFTER: "after the last pose",
+    PoseStatus.GAP: "where poses are too far apart in time",
+    PoseStatus.JUMP: "where poses jump faster than any vehicle drives",
+}
+"""Why a scan has no pose, in words."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -45,6 +55,8 @@ class ScanLog(Recording):
     """(k, 4, 4) pose of the lidar at each scan's stamp; NaN where it has none."""
     pose_status: NDArray[np.int8]
     """(k,) `PoseStatus`: POSED, or why the scan is skipped."""
+    left_out: Mapping[str, int] = field(default_factory=dict)
+    """How many scans of the topic are not among these, by reason."""
     time_ticks: int | None = None
     """How many of the unit of the points' times are a second; None where they cannot be used."""
 
@@ -55,6 +67,22 @@ class ScanLog(Recording):
     def posed(self) -> NDArray[np.bool_]:
         """(k,) which scans have a pose."""
         return np.equal(self.pose_status, PoseStatus.POSED)
+
+    def length_m(self, indices: Int64) -> float:
+        """How far the lidar went over some scans, those with a pose [m]; jumps of poses are none of
+        it.
+        """
+        used = indices[self.posed[indices]]
+        places = self.T_map_lidar[used, :3, 3]
+        steps, seconds = norms(np.diff(places, axis=0)), np.diff(self.stamps_ns[used]) / 1e9
+        parts = np.split(places, np.flatnonzero(jumped(steps, seconds)) + 1)
+        return float(sum(along(part)[-1] for part in parts if len(part)))
+
+    def unposed(self, indices: Int64) -> dict[str, int]:
+        """How many of some scans have no pose, by reason."""
+        status = self.pose_status[indices]
+        counts = {why: int((status == code).sum()) for code, why in SKIPPED.items()}
+        return {why: count for why, count in counts.items() if count}
 
     def scans(self, start: int = 0, stop: int | None = None, step: int = 1) -> Iterator[Scan]:
         """The posed scans of a slice of the log, by index in order of their stamps.
@@ -92,7 +120,7 @@ class ScanLog(Recording):
         """What is in the log; of the scans, those given by index (default: all)."""
         used = np.arange(len(self)) if indices is None else indices
         posed = used[self.posed[used]]
-        path_m = along(self.T_map_lidar[posed, :3, 3])[-1] if len(posed) else 0.0
+        path_m = self.length_m(used)
         stamps = self.stamps_ns[used]
         duration_s = (stamps[-1] - stamps[0]) / 1e9 if len(stamps) else 0.0
         largest_scan = int(self.point_counts[used].max(initial=0))
@@ -104,14 +132,14 @@ class ScanLog(Recording):
             fields=self.fields,
             resident_bytes=int(self.held_bytes[used].max(initial=0))
             + _BYTES_PER_POINT * largest_scan,
-            notes=(
+            contents=(
                 *self.contents,
                 (
                     f"{len(used)} scans of {self.points_topic} over {duration_s:.1f} s, "
                     f"{len(posed)} with a pose from {self.pose_topic}, along {path_m:.1f} m"
                 ),
-                *self.notes,
             ),
+            notes=self.notes,
         )
 
 
@@ -182,9 +210,7 @@ def _jumps(found: Recording, options: LogOptions) -> list[str]:
 
 def _skipped(found: Recording, status: NDArray[np.int8], options: LogOptions) -> list[str]:
     """A note for each reason for which scans have no pose."""
-    reasons = {
-        PoseStatus.BEFORE: "before the first pose",
-        PoseStatus.AFTER: "after the last pose",
+    reasons = SKIPPED | {
         PoseStatus.GAP: f"where poses are more than {options.max_gap_s:g} s apart",
         PoseStatus.JUMP: f"where poses jump faster than {options.max_speed_mps:g} m/s",
     }

@@ -75,9 +75,12 @@ def together(logs: Sequence[ScanLog]) -> ScanLog:
     T_map_lidars = [log.T_map_lidar[rows[:, n]] for n, log in enumerate(logs)]
     T_first_lidar = np.stack([inverse(T_map_first) @ T for T in T_map_lidars], axis=1)
     T_first_lidar[:, 0] = np.eye(4)
+    left_out = first.unposed(np.arange(len(first)))
     notes = [f"scans of {topics} make one each, in the frame {first.frame or 'of the first'}"]
     if lost := int((first.posed & ~found).sum()):
-        notes.append(f"{lost} of {len(first)} scans left out: not every lidar has one at that time")
+        why = "not every lidar has one at that time"
+        left_out[why] = lost
+        notes.append(f"{lost} of {len(first)} scans left out: {why}")
     return replace(
         first,
         points_topic=topics,
@@ -87,6 +90,7 @@ def together(logs: Sequence[ScanLog]) -> ScanLog:
         held_bytes=_sums(logs, rows, "held_bytes"),
         T_map_lidar=T_map_first,
         pose_status=first.pose_status[found],
+        left_out=left_out,
         notes=(*dict.fromkeys(note for log in logs for note in log.notes), *notes),
         reader=ScansTogether(tuple(log.reader for log in logs), rows, T_first_lidar),
     )

@@ -115,10 +115,6 @@ def open_e57(path: str) -> RowSource:
             scans.append(_scan(data[i], i, start, path, size_bytes))
         described = _text(root, "coordinateMetadata").strip()
     crs, notes = _crs(described, path)
-    notes += tuple(
-        f"scan {i} {scan.name!r}: {scan.span.stop - scan.span.start} points"
-        for i, scan in enumerate(scans)
-    )
     found = _Scans(path, tuple(scans))
     names = dict.fromkeys(name for scan in scans for name in scan.fields)
     summary = SourceInfo(
@@ -128,6 +124,10 @@ def open_e57(path: str) -> RowSource:
         points=found.count,
         fields=tuple((name, "number") for name in names),
         crs=crs,
+        contents=tuple(
+            f"scan {i} {scan.name!r}: {scan.span.stop - scan.span.start} points"
+            for i, scan in enumerate(scans)
+        ),
         notes=notes,
     )
     return RowSource(summary, found)

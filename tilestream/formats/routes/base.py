@@ -26,6 +26,8 @@ class Path3:
     stands."""
     stamps_s: Float64 | None = None
     """(n,) time of each point [s], where it was recorded."""
+    notes: tuple[str, ...] = ()
+    """What its reader noticed."""
 
 
 @dataclass(frozen=True)

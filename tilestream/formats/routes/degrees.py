@@ -42,8 +42,7 @@ def metric(
             be used.
     """
     target = _target(path, project_to, map_crs)
-    system = None if crs is None else parsed(crs, path)
-    degrees = system.is_geographic if system is not None else _look_like_degrees(points, drawn)
+    degrees = in_degrees(path, points, crs, drawn)
     if degrees:
         _check_on_earth(path, points)
     if degrees and target is None:
@@ -58,7 +57,9 @@ def metric(
     if crs is None:
         if project_to is not None:
             raise CrsError(f"{path}: is not in degrees, so it cannot be projected to {project_to}")
-        return list(points), map_crs, ()
+        if map_crs is None:
+            return list(points), None, ()
+        return list(points), map_crs, (f"names no CRS: taken to be in {named(map_crs)}",)
     found = enter(crs, path)
     metres = np.array([found.xy.metres, found.xy.metres, found.z.metres])
     points = points if found.metric else [xyz * metres for xyz in points]
@@ -66,6 +67,14 @@ def metric(
         return list(points), found.crs, found.notes
     note = f"projected from {named(found.crs)} to the map's {named(target)}"
     return _projected(path, points, found.crs, target), target, (*found.notes, note)
+
+
+def in_degrees(path: str, points: Sequence[Float64], crs: str | None, drawn: bool) -> bool:
+    """Whether the points of the paths of a file are degrees; how that is told, and arguments, as
+    for `metric`.
+    """
+    system = None if crs is None else parsed(crs, path)
+    return bool(system.is_geographic) if system else _look_like_degrees(points, drawn)
 
 
 def _target(path: str, project_to: str | None, map_crs: str | None) -> str | None:

@@ -130,7 +130,8 @@ def read_all_routes(
             except SourceError as error:
                 lost.append(Lost(part.route_id, error))
     routes, renamed = named(found)
-    told_of = tuple(f"{name}: {note}" for note in (*notes, *renamed))
+    read = (note for part in paths for note in part.notes)
+    told_of = tuple(f"{name}: {note}" for note in (*notes, *renamed, *read))
     return RoutesRead(routes, tuple(lost), told_of)
 
 
@@ -208,13 +209,15 @@ def _drawn(path: str, options: LogOptions) -> Sequence[Path3 | Lost]:
     """The paths that a file draws, in its own coordinates; at least one, or one that is lost."""
     ending = Path(path).suffix.lower()
     if is_log(path):
-        poses = open_log(path, options).trajectory
+        log = open_log(path, options)
+        poses = log.trajectory
         return [
             Path3(
                 Path(path).stem,
                 poses.T_map_lidar[:, :3, 3].copy(),
                 recorded=True,
                 stamps_s=(poses.stamps_ns - poses.stamps_ns[0]) / 1e9,
+                notes=log.notes,
             )
         ]
     if not Path(path).is_file():

@@ -21,13 +21,24 @@ class RoutesRead:
     lost: tuple[Lost, ...] = ()
     """Those that cannot."""
     notes: tuple[str, ...] = ()
-    """What a user should know of the routes that can."""
+    """What a user should know of the routes that can, each with its file before it."""
 
     @property
     def failures(self) -> dict[str, str]:
         """Why routes cannot be used, by their names."""
         names = distinct([f"route {lost.route_id}" for lost in self.lost])
         return dict(zip(names, (str(lost.error) for lost in self.lost), strict=True))
+
+    def notes_of(self, files: Iterable[str]) -> dict[str, list[str]]:
+        """The notes by the file that they are of; what is told of several together is the
+        `routes`'.
+        """
+        found: dict[str, list[str]] = {}
+        named = sorted(files, key=len, reverse=True)
+        for note in self.notes:
+            file = next((name for name in named if note.startswith(f"{name}: ")), "routes")
+            found.setdefault(file, []).append(note.removeprefix(f"{file}: "))
+        return found
 
     def at_least(self, spacing: float) -> "RoutesRead":
         """Without the routes that are too short for two sample points; those are lost.

@@ -4,19 +4,21 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import pandas as pd
+from scipy.spatial import cKDTree
 
 from tilestream.crs import require_same
-from tilestream.errors import PartialError
+from tilestream.errors import PartialError, TileNotReadyError
 from tilestream.factors.catalogue import Which
 from tilestream.factors.rows import Samples, in_route_order, samples_by_tile
-from tilestream.grid import TileKey, whole_mm
+from tilestream.grid import MM_PER_M, TileGrid, TileKey, whole_mm
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, paths_of
 from tilestream.pipeline.engine.stage import Stage
 from tilestream.pipeline.jobs.inventory import make_tables
 from tilestream.pipeline.stages.factors import Looking, factors, factors_task
-from tilestream.pipeline.stages.map_plan import MapPlan
+from tilestream.pipeline.stages.map_plan import MapPlan, apart
 from tilestream.pipeline.stages.observe import Observing, observe, observe_task
 from tilestream.records import Route, RouteZ
 from tilestream.sensor import VLP16, Carrier, Sensor
@@ -24,6 +26,10 @@ from tilestream.settings import LabelSettings, RegistrationSettings, VirtualSett
 from tilestream.store import TileStore
 from tilestream.tables import read_tables
 
+REACH = 250.0
+"""How far from a map a route is refused [m]: nothing of the map is in view of any lidar there."""
+TOLD = 5
+"""So many routes that are far from a map are named."""
 SENSOR_HEIGHT = 2.0
 """Height of the lidar above the road [m] (the paper's vehicle)."""
 
@@ -100,6 +106,52 @@ def samples_along(
     return samples_by_tile(store.grid, routes, spacing)
 
 
+def off_map(keys: Iterable[TileKey], grid: TileGrid, routes: Iterable[Route]) -> list[str]:
+    """A note on the routes that do not come within `REACH` of a map; none: all do.
+
+    Args:
+        keys: the tiles of the map; none: it is not known yet where it lies.
+        grid: their grid.
+        routes: in the map's frame.
+    """
+    have, found = list(keys), []
+    for route in routes if have else ():
+        length, size = route.arc_length[-1], grid.tile_mm / MM_PER_M
+        at = np.append(np.arange(0.0, length, size), length)
+        x, y = (np.interp(at, route.arc_length, route.positions[:, axis]) for axis in (0, 1))
+        wanted = [grid.key_at(*place) for place in zip(x.tolist(), y.tolist(), strict=True)]
+        if not _near(have, wanted, grid):
+            places = f"x {x.min():.0f} to {x.max():.0f}, y {y.min():.0f} to {y.max():.0f} m"
+            found.append(f"{route.route_id} ({places})")
+    if not found:
+        return []
+    more = f" and {len(found) - TOLD} more" if len(found) > TOLD else ""
+    told = f"no tile of the map is within {REACH:g} m of {', '.join(found[:TOLD])}{more}"
+    return [f"{told}: nothing is known there"]
+
+
+def require_near(map_plan: MapPlan, samples: Mapping[TileKey, Samples]) -> None:
+    """Refuse routes of which none comes within `REACH` of a map, before any work.
+
+    Args:
+        map_plan: the map; one without tiles is not known yet.
+        samples: the sample points by tile.
+
+    Raises:
+        TileNotReadyError: where both are, and what to do.
+    """
+    have, wanted = list(map_plan.points), list(samples)
+    if have and wanted and not _near(have, wanted, map_plan.store.grid):
+        places = np.concatenate([some.places for some in samples.values()])
+        raise TileNotReadyError(f"the route {apart(map_plan, places, REACH)}")
+
+
+def _near(have: Sequence[TileKey], wanted: Sequence[TileKey], grid: TileGrid) -> bool:
+    """Whether a tile that is wanted is within `REACH` of one that is there."""
+    distances = np.asarray(cKDTree(np.array(have)).query(np.array(wanted), p=np.inf)[0])
+    return bool(distances.min() <= np.ceil(REACH * MM_PER_M / grid.tile_mm))
+
+
 def plan_factors(
     map_plan: MapPlan,
     samples: Mapping[TileKey, Samples],
@@ -121,6 +173,7 @@ def plan_factors(
         applies: `factors`, or `factors_drive`.
     """
     map_plan.store.grid.require_cell_size(whole_mm(looking.cell_size, "cell_size"))
+    require_near(map_plan, samples)
     folder = os.fspath(out)
     tasks = [
         factors_task(map_plan, key, some, looking, folder, group, applies)
@@ -211,6 +264,7 @@ def plan_observe(
         applies: `observe`, or `observe_drive`.
     """
     map_plan.store.grid.require_cell_size(whole_mm(observing.cell_size, "cell_size"))
+    require_near(map_plan, samples)
     folder = os.fspath(out)
     tasks = [
         observe_task(map_plan, key, some, observing, folder, group, applies)

@@ -1,14 +1,17 @@
 """What the main job would run, from headers alone: before anything is read or written."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from tilestream.errors import StoreNotFoundError
 from tilestream.formats import describe
 from tilestream.grid import MM_PER_M, Box, TileKey
+from tilestream.notes import Notes, noticed
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.stage import Task
+from tilestream.pipeline.jobs.along_routes import off_map
 from tilestream.pipeline.jobs.ingest import plan_ingest, store_settings
 from tilestream.pipeline.jobs.run_inputs import (
     Inputs,
@@ -21,13 +24,18 @@ from tilestream.pipeline.jobs.run_inputs import (
     simulated_folder,
     simulations,
 )
+from tilestream.pipeline.jobs.run_notes import with_logs
 from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
 from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.jobs.simulate import plan_simulation
+from tilestream.pipeline.jobs.sources import map_notes
 from tilestream.pipeline.stages.map_plan import MapPlan, TilePoints
 from tilestream.pipeline.stages.scatter import SourceSpan
 from tilestream.settings import SimulateSettings
 from tilestream.store import TileStore, open_store
+
+PLAN = "plan"
+"""What notes are filed under that are about the plan itself."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +45,9 @@ class Forecast:
     tasks: tuple[Task, ...]
     """The tasks, each after those that it needs; of the map's tiles, those that there may be; of a
     city that is not simulated yet, those that make it."""
-    notes: tuple[str, ...]
-    """What is not known before the job runs."""
+    notes: Notes
+    """What was noticed of the inputs by source, and as `plan` what is not known before the job
+    runs."""
 
 
 def forecast(settings: RunSettings) -> Forecast:
@@ -52,11 +61,14 @@ def forecast(settings: RunSettings) -> Forecast:
     if settings.simulate is not None and not is_simulated(settings):
         return _simulation_first(settings, settings.simulate)
     inputs = inputs_of(settings, None, None)
-    map_plan, reading, notes = _expected_map(settings, inputs)
+    map_plan, reading, notes, sources = _expected_map(settings, inputs)
+    inputs = with_logs(settings, inputs, sources)
     measure = plan_measure(settings, inputs, map_plan)
     done = [Outcome(task.key, task.stage) for task in measure.tasks]
     estimate = plan_estimate(settings, map_plan.store.grid, measure, done)
-    return Forecast((*reading, *measure.tasks, *estimate.tasks), (*notes, *inputs.notes))
+    tasks = (*reading, *measure.tasks, *estimate.tasks)
+    far = {"routes": off_map(map_plan.points, map_plan.store.grid, inputs.routes)}
+    return Forecast(tasks, noticed(notes, inputs.notes, far))
 
 
 def _simulation_first(settings: RunSettings, wanted: SimulateSettings) -> Forecast:
@@ -70,13 +82,13 @@ def _simulation_first(settings: RunSettings, wanted: SimulateSettings) -> Foreca
         if task.writes.known(task.identity) is None
     }  # all drives have one survey
     note = f"first the city is simulated in {folder}; plan again to see what follows"
-    return Forecast(tuple(missing.values()), (note,))
+    return Forecast(tuple(missing.values()), {PLAN: [note]})
 
 
 def _expected_map(
     settings: RunSettings, inputs: Inputs
-) -> tuple[MapPlan, tuple[Task, ...], list[str]]:
-    """The map as it is, or as the bounds of its sources let expect it."""
+) -> tuple[MapPlan, tuple[Task, ...], Notes, list[dict[str, Any]]]:
+    """The map as it is, or as the bounds of its sources let expect it; its sources as recorded."""
     try:
         store = open_store(settings.store_url)
     except StoreNotFoundError:
@@ -84,10 +96,11 @@ def _expected_map(
             raise
     else:
         if store.sources():
-            notes = ["the map is there; changed sources are read again"]
+            told = {PLAN: ["the map is there; changed sources are read again"]}
             partial = bool(inputs.sources) or settings.map.partial
-            return MapPlan.of_store(store, partial=partial), (), notes
-    plan = plan_ingest(
+            there = MapPlan.of_store(store, partial=partial)
+            return there, (), noticed(told, map_notes(store)), store.sources()
+    planned = plan_ingest(
         inputs.sources,
         settings.store_url,
         ingest_settings(settings.map),
@@ -98,7 +111,7 @@ def _expected_map(
     store = TileStore(settings.store_url, store_settings(ingest_settings(settings.map)))
     have: dict[TileKey, TilePoints] = {}
     unknown: list[str] = []
-    spans = [task.reads["blocks"] for task in plan.tasks]
+    spans = [task.reads["blocks"] for task in planned.scatters.tasks]
     opened_with = {span.path: span.options for span in spans if isinstance(span, SourceSpan)}
     for path, options in sorted(opened_with.items()):
         bounds = describe(path, **dict(options)).bounds
@@ -111,4 +124,6 @@ def _expected_map(
     notes = [f"at most {len(have)} tiles, by the bounds of the sources; reading tells which"]
     if unknown:
         notes.append(f"only reading tells where the points of {', '.join(unknown[:3])} are")
-    return MapPlan(store, have), plan.tasks, notes
+    sources = [source.record for source in planned.found]
+    told = noticed({PLAN: notes}, planned.notes)
+    return MapPlan(store, have), planned.scatters.tasks, told, sources

@@ -15,6 +15,7 @@ from tilestream.errors import (
 )
 from tilestream.formats.logs import ScanSelection
 from tilestream.lock import only_writer
+from tilestream.notes import noticed
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.outputs import TileArrays
@@ -133,6 +134,11 @@ class Reading:
         self._open = {key: span.path for key, span in spans.items() if isinstance(span, SourceSpan)}
         self._read: dict[str, list[Outcome]] = {source.path: [] for source in found}
 
+    @property
+    def notes(self) -> dict[str, list[str]]:
+        """What the headers of the sources tell, by source."""
+        return noticed({one.path: one.info.notes for one in self.found if one.info is not None})
+
     def first(self) -> Plan:
         """What to run first: the tasks that read the sources.
 
@@ -220,23 +226,7 @@ class Reading:
 
     def _record(self) -> None:
         fragments_of(self.store.url).remove()
-        self.store.end(
-            [
-                {
-                    "path": source.path,
-                    "state": source.state,
-                    "format": source.info.format if source.info else "",
-                    "size_bytes": source.info.size_bytes if source.info else 0,
-                    "crs": source.info.crs if source.info else None,
-                    "notes": list(source.info.notes) if source.info else [],
-                    "points": source.points,
-                    "dropped": source.dropped,
-                    "reason": source.reason,
-                }
-                for source in self.found
-            ],
-            MADE_BY,
-        )
+        self.store.end([source.record for source in self.found], MADE_BY)
 
 
 def read_sources(
@@ -265,7 +255,7 @@ def plan_ingest(
     memory: int = DEFAULT_MEMORY,
     log_options: LogOptions | None = None,
     scans: ScanSelection | None = None,
-) -> Plan:
+) -> Reading:
     """What `ingest` would read first, without running or writing anything.
 
     The tasks that write tiles are planned from what the reading finds. Arguments and errors as for
@@ -276,7 +266,7 @@ def plan_ingest(
         if source.reason:
             raise SourceError(source.reason)
     store = TileStore(str(url), store_settings(with_crs(settings, found)))
-    return Reading(store, found, memory, current=False).scatters
+    return Reading(store, found, memory, current=False)
 
 
 def _create_or_resume(url: str, settings: IngestSettings, found: Sequence[Source]) -> TileStore:

@@ -1,7 +1,7 @@
 """The job that measures: a log and a map in, the localization error of every sample point out."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,9 +20,10 @@ from tilestream.pipeline.engine.outputs import Parquet
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, paths_of
 from tilestream.pipeline.engine.stage import Task
 from tilestream.pipeline.jobs.inventory import make_tables
+from tilestream.pipeline.jobs.overlap import Overlap, overlap
 from tilestream.pipeline.stages.drive_scans import DriveScans, Reading, Sample, opened
 from tilestream.pipeline.stages.label import label
-from tilestream.pipeline.stages.map_plan import MapPlan
+from tilestream.pipeline.stages.map_plan import MapPlan, apart
 from tilestream.pipeline.stages.register import MARGIN, Measuring, register
 from tilestream.records import Float64, TruePose
 from tilestream.settings import LabelSettings, RegistrationSettings, StartSettings
@@ -52,6 +53,7 @@ def localize(
     memory: int = DEFAULT_MEMORY,
     watch: Watch | None = None,
     partial: bool = False,
+    allow_overlap: bool = False,
 ) -> pd.DataFrame:
     """Localize a drive in a map from many starts per sample point: what the error there is.
 
@@ -76,13 +78,15 @@ def localize(
         memory: what a task may use [bytes].
         watch: is told of each task that ended.
         partial: go on with a map that is not whole; scans that could see what is missing say so.
+        allow_overlap: measure also with scans that the map was made of, whose errors are too small.
 
     Returns:
         A row per sample point in the order of the drive; `status` and `reason` say where none
         could be measured.
 
     Raises:
-        UsageError: settings that cannot be, a spacing that is not positive, no scan selected.
+        UsageError: settings that cannot be, a spacing that is not positive, no scan selected, or
+            one that the map was made of (`allow_overlap`).
         SourceError: the log cannot be read, has no clouds or no poses.
         TileNotReadyError: no tile of the map within reach of the drive.
         IncompleteError: the map is not whole, and not `partial`.
@@ -90,16 +94,20 @@ def localize(
         PlanError: a task does not fit `memory`.
         PartialError: some tasks failed; the message lists them, the rest is done.
     """
+    how = replace(reading, path=os.fspath(log)) if reading else Reading(os.fspath(log))
+    scans = scans or ScanSelection()
+    if not allow_overlap:
+        drive_overlap(how, scans, spacing, store.sources()).require_none()
     plan = plan_localize(
         MapPlan.of_store(store, partial=partial),
-        replace(reading, path=os.fspath(log)) if reading else Reading(os.fspath(log)),
+        how,
         out,
         cell_size=cell_size,
         spacing=spacing,
         registration=registration or LabelSettings().registration,
         starts=starts or StartSettings(),
         true_pose=true_pose,
-        scans=scans or ScanSelection(),
+        scans=scans,
         starts_per_task=starts_per_task,
         memory=memory,
     )
@@ -138,10 +146,8 @@ def plan_localize(
     reach = (reading.range_max or REACH) + MARGIN
     places = log.T_map_lidar[:, :2, 3]
     if not tiles_in_reach(map_plan, places[[sample.scan for sample in samples]], reach):
-        x, y = places[samples[0].scan]
         raise TileNotReadyError(
-            f"{map_plan.store.url}: no tile within {reach:g} m of {log.path}, which begins at "
-            f"({x:.1f}, {y:.1f}) m: is the log in the map's frame?"
+            f"{log.path}: {apart(map_plan, places[[sample.scan for sample in samples]], reach)}"
         )
     tasks: list[Task] = []
     for first in range(0, len(samples), SCANS_PER_TASK):
@@ -185,6 +191,19 @@ def choose_samples(log: ScanLog, scans: ScanSelection, spacing: float) -> tuple[
         Sample(number, int(chosen[row]), int(log.stamps_ns[chosen[row]]), float(arc[row]))
         for number, row in enumerate(rows)
     )
+
+
+def drive_overlap(
+    reading: Reading, scans: ScanSelection, spacing: float, sources: Iterable[Mapping[str, Any]]
+) -> Overlap:
+    """What the scans of a drive that are localized share with the sources of a map.
+
+    Raises:
+        UsageError, SourceError: as `localize`.
+    """
+    log = opened(_absolute(reading))
+    samples = choose_samples(log, scans, spacing)
+    return overlap(log, [sample.scan for sample in samples], sources)
 
 
 def labelled_places(

@@ -10,6 +10,7 @@ simulate? -> scatter -> merge, cells, terms, factors, surfels, observe, register
 import json
 import os
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from tilestream.files import Files
 from tilestream.lock import only_writer
 from tilestream.model.dataset import Dataset
 from tilestream.model.file import load_model
+from tilestream.notes import noticed
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.cluster import report_kept
 from tilestream.pipeline.engine.costs import learn
@@ -44,6 +46,12 @@ from tilestream.pipeline.jobs.run_inputs import (
     inputs_of,
     read_map,
     seen_otherwise,
+)
+from tilestream.pipeline.jobs.run_notes import (
+    drives_measured,
+    lost_labels,
+    run_notes,
+    with_logs,
 )
 from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
 from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
@@ -108,8 +116,9 @@ def _run(settings: RunSettings, client: Any | None, watch: Watch | None) -> Path
         with report_kept(client, settings.folder / "dask-performance.html"):
             inputs = inputs_of(settings, client, watch)
             book.failures |= inputs.failures
-            book.facts["notes"] = [*inputs.notes, *_on_degraded(settings, inputs)]
             story = _Story(settings, inputs, book)
+            inputs = story.inputs
+            book.facts["notes"] = dict(inputs.notes)
             execute(story.first(), client, book.listening(watch), grow=story.grown)
             if story.estimate is None:
                 story.estimate = story.plan_estimate()
@@ -117,6 +126,7 @@ def _run(settings: RunSettings, client: Any | None, watch: Watch | None) -> Path
                 _estimate_large(story.estimate, client, book.listening(watch))
         learn(book.tasks, book.outcomes)
         settle(book.tasks, book.failures)
+        book.facts["notes"] = run_notes(settings, inputs, story.store)
         _report(settings, inputs, story, book)
     book.facts["files"] = checksums(settings.folder)
     for name in ("", "tables", "report", "report/figures"):
@@ -159,12 +169,14 @@ class _Story:
 
     def __init__(self, settings: RunSettings, inputs: Inputs, book: Book) -> None:
         self.settings = settings
-        self.inputs = inputs
         self.book = book
         self.reading: Reading | None = read_map(settings, inputs)
         self.store: TileStore = (
             self.reading.store if self.reading else open_store(settings.store_url)
         )
+        found = self.reading.found if self.reading else None
+        sources = self.store.sources() if found is None else [source.record for source in found]
+        self.inputs = with_logs(settings, inputs, sources)
         self.measure = Plan((), settings.memory)
         self.estimate: Plan | None = None
         """None: not planned yet, or to be grown by all workers together."""
@@ -265,9 +277,11 @@ def _report(settings: RunSettings, inputs: Inputs, story: _Story, book: Book) ->
     """Gather what is done and write the report; without a single factor table there is none."""
     good = {outcome.key for outcome in book.outcomes if outcome.ok}
     done = Done(tuple(task for task in book.tasks if task.key in good))
+    measured = drives_measured(inputs, done)
+    book.facts["drives"] = [drive.plain() for drive in measured]
     if not done.outputs("factors"):
         return
-    book.facts["notes"] += heights_told(done, settings)
+    book.facts["notes"] = noticed(book.facts["notes"], heights_told(done, settings))
     known = done.dataset()
     if known is not None:
         book.facts |= {"labelled": len(known), "lost_labels": known.losses}
@@ -278,6 +292,9 @@ def _report(settings: RunSettings, inputs: Inputs, story: _Story, book: Book) ->
         _facts(settings, inputs, book, known),
         settings,
         seen_otherwise(settings, inputs.drives),
+    )
+    found = replace(
+        found, notes=book.facts["notes"], drives=measured, lost_labels=lost_labels(known)
     )
     text = json.dumps(plain(evaluation), indent=1, allow_nan=False)
     write_text(settings.folder / "tables" / "evaluation.json", text + "\n")
@@ -298,7 +315,6 @@ def _facts(
         "map": settings.store_url,
         "sensor": settings.vehicle.name,
         "labelled places": 0 if known is None else len(known),
-        "lost labels": {} if known is None else known.losses,
         "model": _model_facts(settings, book),
         "matcher": {
             "name": settings.label.registration.told,
@@ -308,18 +324,8 @@ def _facts(
         "drives": {d.group: d.model_dump(exclude_defaults=True) for d in inputs.drives},
         "core-seconds by stage, all calls": stages,
         "failures": dict(book.failures),
-        "notes": book.facts["notes"],
         "attributions": list(inputs.attributions),
     }
-
-
-def _on_degraded(settings: RunSettings, inputs: Inputs) -> list[str]:
-    """What a reader must know of drives that were read as another lidar than the vehicle's."""
-    groups = seen_otherwise(settings, inputs.drives)
-    if not groups:
-        return []
-    told = f"observed as the lidar that they are read as: {', '.join(groups)}"
-    return [f"{told}; the estimates along the routes are for the vehicle as it is"]
 
 
 def _model_facts(settings: RunSettings, book: Book) -> dict[str, Any]:

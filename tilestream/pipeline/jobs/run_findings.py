@@ -80,15 +80,16 @@ def places_of(done: Done) -> pd.DataFrame:
     return joined.astype(dtypes)
 
 
-def heights_told(done: Done, settings: RunSettings) -> list[str]:
-    """What the heights of the routes and of the drives' lidars tell, a sentence each."""
+def heights_told(done: Done, settings: RunSettings) -> dict[str, list[str]]:
+    """What the heights of the routes and of the drives' lidars tell, by what it is about."""
     places = read_tables(paths_of(done.outputs("factors")))
-    notes = notes_of_routes(places, settings.sensor_height, settings.route_z)
+    notes = {"routes": notes_of_routes(places, settings.sensor_height, settings.route_z)}
     of_drive: dict[str, list[str]] = {}
     for path in paths_of(done.outputs("label")):
         of_drive.setdefault(path.rsplit("/", 2)[1], []).append(path)
     for name, paths in of_drive.items():
-        notes += note_of_drive(name, read_tables(paths)["lidar_height"], settings.sensor_height)
+        heights = read_tables(paths)["lidar_height"]
+        notes[f"drive {name}"] = note_of_drive(heights, settings.sensor_height)
     return notes
 
 

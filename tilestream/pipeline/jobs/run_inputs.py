@@ -1,6 +1,6 @@
 """What the main job works on: its settings and files."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from glob import glob
 from pathlib import Path
@@ -12,6 +12,7 @@ from tilestream.formats.routes import RoutesRead, read_all_routes, together
 from tilestream.model.dataset import made_with
 from tilestream.model.file import load_model
 from tilestream.model.training import check_making
+from tilestream.notes import Notes, noticed
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.jobs.ingest import Reading, read_sources
 from tilestream.pipeline.jobs.run_settings import RunSettings
@@ -21,6 +22,7 @@ from tilestream.pipeline.stages.drive_scans import Reading as DriveReading
 from tilestream.pipeline.stages.observe import Observing
 from tilestream.pipeline.stages.samples import COLUMNS
 from tilestream.records import Route
+from tilestream.report.drives import DriveMeasured
 from tilestream.sensor import Sensor
 from tilestream.settings import (
     DriveSettings,
@@ -33,6 +35,9 @@ from tilestream.settings import (
 from tilestream.simulation.settings import SimulationSettings, load_preset
 from tilestream.store import open_store
 
+JOB = "job"
+"""What notes are filed under that are about the job as a whole."""
+
 
 @dataclass(frozen=True)
 class Inputs:
@@ -44,10 +49,12 @@ class Inputs:
     """The logs to measure on."""
     routes: tuple[Route, ...]
     """Where to estimate."""
-    notes: tuple[str, ...] = ()
-    """What a reader of the results must know."""
+    notes: Notes = field(default_factory=dict)
+    """What a reader of the results must know, by source."""
     failures: Mapping[str, str] = field(default_factory=dict)
     """Which routes are left out, and why."""
+    to_measure: tuple[DriveMeasured, ...] = ()
+    """The scans of each drive, as soon as its log is opened."""
     attributions: tuple[str, ...] = ()
     """Whose data it is."""
 
@@ -64,9 +71,8 @@ def inputs_of(settings: RunSettings, client: Any | None, watch: Watch | None) ->
         files = settings.routes or tuple(dict.fromkeys(drive.log for drive in drives))
         if not files:
             return _inputs(settings.map.sources, drives, *_all_streets(settings))
-        read = _routes(files, settings, settings.map.sources)
-        notes = tuple(_other_lidars(settings))
-        return _inputs(settings.map.sources, drives, read.at_least(settings.spacing), notes)
+        read = _routes(files, settings, settings.map.sources).at_least(settings.spacing)
+        return _inputs(settings.map.sources, drives, read, files, {JOB: _other_lidars(settings)})
     folder = simulated_folder(settings)
     wanted = settings.simulate
     for drive in simulations(wanted):
@@ -79,7 +85,8 @@ def inputs_of(settings: RunSettings, client: Any | None, watch: Watch | None) ->
     ]
     preset = load_preset(wanted.preset)
     sources = settings.map.sources or (str(folder / "survey" / "*.laz"),)
-    read = _routes(settings.routes or (str(folder / "routes.geojson"),), settings, sources)
+    files = settings.routes or (str(folder / "routes.geojson"),)
+    read = _routes(files, settings, sources)
     if wanted.paths is not None and not settings.routes:
         asked = tuple(route for route in read.routes if route.route_id in wanted.paths)
         read = replace(read, routes=asked)
@@ -87,7 +94,8 @@ def inputs_of(settings: RunSettings, client: Any | None, watch: Watch | None) ->
         sources,
         settings.drives or tuple(logs),
         read.at_least(settings.spacing),
-        (f"Simulated, preset {preset.preset}: {preset.note}",),
+        files,
+        {JOB: [f"simulated, preset {preset.preset}: {preset.note}"]},
     )
     return replace(inputs, attributions=(ATTRIBUTION,))
 
@@ -96,25 +104,25 @@ def _inputs(
     sources: tuple[str, ...],
     drives: tuple[DriveSettings, ...],
     read: RoutesRead,
-    notes: tuple[str, ...],
+    files: Sequence[str],
+    notes: Notes,
 ) -> Inputs:
-    """The files of a job, with what is to be told of its routes."""
-    left_out = (f"{name} is left out: {reason}" for name, reason in read.failures.items())
-    return Inputs(
-        sources, drives, read.routes, (*notes, *read.notes, *left_out), failures=read.failures
-    )
+    """The files of a job, with what is to be told of its routes, which are of these files."""
+    left_out = [f"{name} is left out: {reason}" for name, reason in read.failures.items()]
+    told = noticed(notes, read.notes_of(files), {"routes": left_out})
+    return Inputs(sources, drives, read.routes, told, failures=read.failures)
 
 
-def _other_lidars(settings: RunSettings) -> Iterator[str]:
+def _other_lidars(settings: RunSettings) -> list[str]:
     """A note for each drive that is labelled with another number of lidars than the vehicle has."""
     has = len(settings.vehicle.sensors)
-    for drive in settings.drives:
-        named = len((drive.points_topic or "").split(","))
-        if named != has:
-            yield (
-                f"Drive {drive.group} is labelled with the scans of {named} of its lidars, the "
-                f"vehicle is observed with {has}: name a topic for each in points_topic."
-            )
+    named = {drive.group: len((drive.points_topic or "").split(",")) for drive in settings.drives}
+    return [
+        f"drive {group} is labelled with the scans of {lidars} of its lidars, the vehicle is "
+        f"observed with {has}: name a topic for each in points_topic"
+        for group, lidars in named.items()
+        if lidars != has
+    ]
 
 
 def simulations(wanted: SimulateSettings) -> list[SimulationSettings]:
@@ -148,8 +156,8 @@ LANES = "lanelet2_map.osm"
 """The lanes that Autoware keeps beside the point clouds of a map."""
 
 
-def _all_streets(settings: RunSettings) -> tuple[RoutesRead, tuple[str, ...]]:
-    """The lanes of the map directories among the sources, and what is to be told of them.
+def _all_streets(settings: RunSettings) -> tuple[RoutesRead, list[str], Notes]:
+    """The lanes of the map directories among the sources, their files, and what is to be told.
 
     Raises:
         UsageError: there are none, or none as long as the spacing.
@@ -174,7 +182,7 @@ def _all_streets(settings: RunSettings) -> tuple[RoutesRead, tuple[str, ...]]:
     told = f"no routes were given: all streets of the map, {len(long)} lanes of {', '.join(files)}"
     short = len(lanes) - len(long)
     told += f"; {short} shorter than the spacing are left out" if short else ""
-    return replace(read, routes=long), (told,)
+    return replace(read, routes=long), files, {JOB: [told]}
 
 
 def _routes(files: Sequence[str], settings: RunSettings, sources: Sequence[str]) -> RoutesRead:

@@ -6,18 +6,21 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from tilestream.crs import one_crs
+from tilestream.crs import named, one_crs
 from tilestream.errors import SourceError, SourceNotFoundError, StoreNotFoundError, UsageError
 from tilestream.formats import expand_sources, open_source
 from tilestream.formats.base import SourceInfo, Span
+from tilestream.formats.drive import DriveSource
 from tilestream.formats.logs import ScanSelection, is_log
 from tilestream.formats.registry import state_of
 from tilestream.marks import hash_of
+from tilestream.notes import noticed
 from tilestream.pipeline.engine.plan import megabytes
+from tilestream.pipeline.jobs.overlap import packed
 from tilestream.pipeline.jobs.strays import Kept
 from tilestream.pipeline.stages.scatter import Fragment, needed_to_open
 from tilestream.settings import IngestSettings, LogOptions
-from tilestream.store import open_store
+from tilestream.store import TileStore, open_store
 
 POINTS_PER_TASK = 4_000_000
 """Points of a source that one scatter task reads: seconds of work, not milliseconds."""
@@ -41,8 +44,28 @@ class Source:
     """Finite points that were read."""
     dropped: int = 0
     """Points that were not finite."""
+    scans: str = ""
+    """The scans of a log that become map points (`overlap.packed`)."""
     reason: str = ""
     """Why it failed; empty where it did not."""
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """What a store keeps of it."""
+        info = self.info
+        return {
+            "path": self.path,
+            "state": self.state,
+            "format": info.format if info else "",
+            "size_bytes": info.size_bytes if info else 0,
+            "crs": info.crs if info else None,
+            "contents": list(info.contents) if info else [],
+            "notes": list(info.notes) if info else [],
+            "scans": self.scans,
+            "points": self.points,
+            "dropped": self.dropped,
+            "reason": self.reason,
+        }
 
 
 def examine_all(
@@ -96,7 +119,10 @@ def _examine(path: str, options: dict[str, Any]) -> Source:
         spans = tuple(source.spans(POINTS_PER_TASK))
     except (SourceError, OSError) as error:
         return replace(known, reason=str(error))
-    return replace(known, info=info, spans=spans)
+    scans = ""
+    if isinstance(source, DriveSource):
+        scans = packed(source.log.stamps_ns[source.used], source.log.point_counts[source.used])
+    return replace(known, info=info, spans=spans, scans=scans)
 
 
 def within(found: Sequence[Source], memory: int) -> list[Source]:
@@ -133,6 +159,22 @@ def as_read(source: Source, indices: Sequence[Fragment], kept: Kept) -> Source:
     info = replace(source.info, notes=(*source.info.notes, *notes))
     dropped = sum(index.dropped for index in indices)
     return replace(source, info=info, points=kept.points, dropped=dropped)
+
+
+def map_notes(store: TileStore) -> dict[str, list[str]]:
+    """What was noticed of the sources that a map was made from, by source."""
+    found: dict[str, list[str]] = {}
+    for source in store.sources():
+        found[source["path"]] = list(source["notes"])
+        if store.settings.crs is not None and source["crs"] is None:
+            told = f"names no CRS: taken to be in the map's, {named(store.settings.crs)}"
+            found[source["path"]].append(told)
+        if source["dropped"] and not is_log(source["path"]):  # of a log: pulses without a return
+            told = f"{source['dropped']:,} points are not finite and left out"
+            found[source["path"]].append(told)
+        if source["reason"]:
+            found[source["path"]].append(f"not read: {source['reason']}")
+    return noticed(found)
 
 
 def crs_of_map(sources: Iterable[str], url: str, asked: str | None) -> str | None:

@@ -19,8 +19,10 @@ from tilestream.pipeline.stages.scatter import Fragment
 from tilestream.records import Int64
 
 FAR = 10_000.0
-"""Gap that parts neither a street nor a district from the rest of a source [m]: at least this, and
-less than twice."""
+"""Edge of the squares of a lattice that tell what is far [m]: parts of a source are apart where an
+empty square lies between them, so at least by this, and always by twice as much. The squares are
+the same for every tile size that divides them, as 20, 50, 100 and 125 m do; with another one a tile
+across a border counts to the square of its lower corner."""
 TOO_FAR = 1_000_000.0
 """How far apart the parts of a source may be [m]: no projection in metres reaches further."""
 FEW, FEW_SHARE = 10, 0.01

@@ -3,6 +3,8 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from tilestream.factors.surfels import surfel_mm, surfels_table
 from tilestream.factors.terms import terms_table
 from tilestream.grid import Box, TileKey
@@ -13,6 +15,7 @@ from tilestream.pipeline.stages.cells import cells
 from tilestream.pipeline.stages.map_part import MapPart
 from tilestream.pipeline.stages.surfels import surfels
 from tilestream.pipeline.stages.terms import terms
+from tilestream.records import Float64
 from tilestream.store import TileStore, TileTable, cells_table
 
 EXPECTED_DENSITY = 100
@@ -29,6 +32,17 @@ class TilePoints:
     """Key of the task that merges them; empty: they are there."""
     count: int
     """How many, or how many are expected."""
+
+
+def apart(plan: "MapPlan", places: Float64, reach: float) -> str:
+    """That a map has nothing within a reach [m] of (n, 2) places: where both are, what to do."""
+    (left, low), (right, high) = places.min(axis=0), places.max(axis=0)
+    extents = [(left, right, low, high), plan.extent()]
+    here, there = ("x {:.0f} to {:.0f}, y {:.0f} to {:.0f} m".format(*one) for one in extents)
+    return (
+        f"lies at {here}, and the map {plan.store.url} at {there}: no tile within {reach:g} m; "
+        "is it in another CRS, or in another frame than the map?"
+    )
 
 
 class MapPlan:
@@ -81,6 +95,14 @@ class MapPlan:
     def over(self, box: Box) -> list[TileKey]:
         """The tiles of the map that a box touches, sorted."""
         return [key for key in self.store.grid.keys_over(box) if key in self.points]
+
+    def extent(self) -> tuple[float, float, float, float]:
+        """Lowest and highest x, lowest and highest y of its tiles [m]; NaN: it has none."""
+        if not self.points:
+            return np.nan, np.nan, np.nan, np.nan
+        keys, size = np.array(list(self.points)), self.store.settings.tile_size
+        (left, low), (right, high) = keys.min(axis=0) * size, (keys.max(axis=0) + 1) * size
+        return float(left), float(right), float(low), float(high)
 
     def cells(self, key: TileKey, cell_mm: int) -> Task:
         """The task that makes the cells of a tile."""

@@ -1,0 +1,44 @@
+"""What is in anything that tilestream reads or writes: one function for each kind of it.
+
+A new kind is a function that describes it, and a line in `KINDS`.
+"""
+
+import os
+
+from tilestream.apps.info.files import KINDS as OF_FILES
+from tilestream.apps.info.made import KINDS as OF_MADE
+from tilestream.apps.info.record import Info, Kind
+from tilestream.errors import UnknownFormatError
+from tilestream.files import Files
+from tilestream.formats import describe
+from tilestream.settings import LogOptions
+
+__all__ = ["KINDS", "Info", "info"]
+
+KINDS: tuple[Kind, ...] = (*OF_MADE, *OF_FILES)
+"""What can be described; the first that fits is it."""
+
+
+def info(path: str | os.PathLike[str], log_options: LogOptions | None = None) -> Info:
+    """What is in a file, a folder, a tile store, a run directory or a model.
+
+    Args:
+        path: any of `KINDS`; a store or a run directory also at an fsspec URL.
+        log_options: topics and frames of a log; None: found.
+
+    Raises:
+        SourceNotFoundError: nothing there.
+        UnknownFormatError: nothing that tilestream reads.
+        TilestreamError: it is damaged, or cannot be read; as its own reader says.
+    """
+    name = os.fspath(path)
+    names = frozenset(Files.at(name).names())
+    for kind in KINDS:
+        if kind.fits(name, names):
+            return kind.describe(name, log_options or LogOptions())
+    try:
+        describe(name)  # says what is there, and what would be read
+    except UnknownFormatError as error:
+        known = "; ".join(kind.name for kind in KINDS)
+        raise UnknownFormatError(f"{error}; besides there are {known}") from None
+    raise UnknownFormatError(f"{name}: of no known kind")

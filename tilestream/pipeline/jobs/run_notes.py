@@ -1,0 +1,103 @@
+"""What a run noticed of its inputs, and how much of its drives it measured and can use."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import pandas as pd
+
+from tilestream.model.dataset import Dataset
+from tilestream.notes import noticed
+from tilestream.pipeline.engine.outputs import Parquet
+from tilestream.pipeline.jobs.along_routes import off_map
+from tilestream.pipeline.jobs.drive_measured import to_measure, with_labels
+from tilestream.pipeline.jobs.localize import drive_overlap
+from tilestream.pipeline.jobs.run_findings import Done
+from tilestream.pipeline.jobs.run_inputs import (
+    JOB,
+    Inputs,
+    reading_of,
+    scans_of,
+    seen_otherwise,
+)
+from tilestream.pipeline.jobs.run_settings import RunSettings
+from tilestream.pipeline.jobs.sources import map_notes
+from tilestream.pipeline.stages.drive_scans import opened
+from tilestream.pipeline.stages.label import label
+from tilestream.report.drives import DriveMeasured
+from tilestream.store import TileStore
+
+NO_ROWS = pd.DataFrame({"status": [], "reason": []})
+"""Where a drive has no labels."""
+
+
+def with_logs(
+    settings: RunSettings, inputs: Inputs, sources: Sequence[Mapping[str, Any]]
+) -> Inputs:
+    """The files of a job with what the logs of its drives tell, each opened once: notes, also on
+    what they share with the sources of the map, and which scans are to be measured.
+
+    Args:
+        settings: the job.
+        inputs: its files.
+        sources: what the map is made of, as a store records it.
+
+    Raises:
+        UsageError: scans that are to be localized are in the map, and not `allow_overlap`.
+        SourceError: a log that cannot be read.
+    """
+    notes: list[dict[str, list[str]]] = []
+    found = []
+    for drive in inputs.drives:
+        reading, scans, spacing = reading_of(drive), scans_of(drive), settings.spacing
+        log, shared = opened(reading), drive_overlap(reading, scans, spacing, sources)
+        if not settings.label.allow_overlap:
+            shared.require_none()
+        notes.append({drive.log: [*log.notes, *shared.notes]})
+        found.append(to_measure(drive.group, log, scans, spacing))
+    return replace(inputs, notes=noticed(inputs.notes, *notes), to_measure=tuple(found))
+
+
+def run_notes(settings: RunSettings, inputs: Inputs, store: TileStore) -> dict[str, list[str]]:
+    """All that was noticed of the inputs of a run whose map is there, by source."""
+    own = {JOB: _on_degraded(settings, inputs)}
+    known = () if store.manifest is None else store.manifest.identities
+    far = {"routes": off_map(known, store.grid, inputs.routes)}
+    return noticed(inputs.notes, own, far, map_notes(store))
+
+
+def _on_degraded(settings: RunSettings, inputs: Inputs) -> list[str]:
+    """What a reader must know of drives that were read as another lidar than the vehicle's."""
+    groups = seen_otherwise(settings, inputs.drives)
+    if not groups:
+        return []
+    told = f"observed as the lidar that they are read as: {', '.join(groups)}"
+    return [f"{told}; the estimates along the routes are for the vehicle as it is"]
+
+
+def drives_measured(inputs: Inputs, done: Done) -> tuple[DriveMeasured, ...]:
+    """How much of each drive was measured."""
+    tables: dict[str, list[pd.DataFrame]] = {}
+    for task in done.outputs(label.name):
+        assert isinstance(task.writes, Parquet)
+        group = task.writes.path.rsplit("/", 2)[1]
+        tables.setdefault(group, []).append(task.writes.read().rows)
+    return tuple(
+        with_labels(drive, pd.concat(tables.get(drive.drive, [NO_ROWS]), ignore_index=True))
+        for drive in inputs.to_measure
+    )
+
+
+def lost_labels(dataset: Dataset | None) -> list[dict[str, Any]]:
+    """The labels that no model can learn from: `reason`, `count`, and in `detail` the commonest of
+    what is known besides; the commonest reason first.
+    """
+    if dataset is None or dataset.lost.empty:
+        return []
+    found = []
+    for reason, rows in dataset.lost.groupby("reason"):
+        detail = rows["detail"].astype(str).value_counts()
+        more = f" (and {len(detail) - 1:,} others)" if len(detail) > 1 else ""
+        told = str(detail.index[0]) + more if detail.index[0] else ""
+        found.append({"reason": str(reason), "count": len(rows), "detail": told})
+    return sorted(found, key=lambda lost: (-int(str(lost["count"])), str(lost["reason"])))
