@@ -64,14 +64,14 @@ def tables(folder: Path) -> pd.DataFrame:
 def test_a_degraded_drive_is_observed_as_a_job_of_that_lidar_would_be(
     run: RunSettings, tmp_path: Path
 ) -> None:
-    of_drive = tables(run.folder / "tables" / "drives" / "9m" / "observability")
+    of_drive = tables(Path(run.out) / "tables" / "drives" / "9m" / "observability")
     alone = observed(run, SHORT, tmp_path)
     assert len(of_drive) == len(alone) > 5
     order = {"by": KEYS, "ignore_index": True}
     pd.testing.assert_frame_equal(
         of_drive.sort_values(**order), alone.sort_values(**order), check_exact=True
     )
-    usual = tables(run.folder / "tables" / "observability").sort_values(**order)
+    usual = tables(Path(run.out) / "tables" / "observability").sort_values(**order)
     pd.testing.assert_frame_equal(
         usual, observed(run, USUAL, tmp_path / "usual").sort_values(**order), check_exact=True
     )
@@ -82,8 +82,8 @@ def test_its_labels_are_joined_with_that_and_the_estimate_is_of_the_vehicle(
     run: RunSettings,
 ) -> None:
     rows = ts.dataset(run.folder).rows
-    of_drive = tables(run.folder / "tables" / "drives" / "9m" / "observability")
-    usual = tables(run.folder / "tables" / "observability")
+    of_drive = tables(Path(run.out) / "tables" / "drives" / "9m" / "observability")
+    usual = tables(Path(run.out) / "tables" / "observability")
     names = list(AVERAGED)
     for group, table in (("short", of_drive), ("whole", usual)):
         mine = rows[rows["group"] == group]
@@ -91,10 +91,10 @@ def test_its_labels_are_joined_with_that_and_the_estimate_is_of_the_vehicle(
         joined = mine[["path", "arc_length"]].merge(seen, on=["path", "arc_length"])
         assert len(joined) == len(mine) > 5
         np.testing.assert_array_equal(joined[names], mine[names])
-    places = pd.read_parquet(run.folder / "report" / "places.parquet").set_index(KEYS)
+    places = pd.read_parquet(Path(run.out) / "report" / "places.parquet").set_index(KEYS)
     vehicle = averaged_along(usual).set_index(KEYS)["vd_mean"] + OFFSET
     np.testing.assert_array_equal(places["estimate"], vehicle[places.index])
-    report = json.loads((run.folder / "report" / "report.json").read_text())
+    report = json.loads((Path(run.out) / "report" / "report.json").read_text())
     assert any("read as: short;" in note for note in report["facts"]["notes"])
 
 
@@ -102,7 +102,7 @@ def test_its_labels_are_joined_with_that_and_the_estimate_is_of_the_vehicle(
 def test_no_estimate_of_the_vehicle_stands_beside_its_labels(
     run: RunSettings, offset: float | None
 ) -> None:
-    places = pd.read_parquet(run.folder / "report" / "places.parquet")
+    places = pd.read_parquet(Path(run.out) / "report" / "places.parquet")
     found = labels_of(ts.dataset(run.folder), places, None, ["short"], offset).set_index("group")
     short, whole = found.loc["short"], found.loc["whole"]
     if offset is None:  # a model that was trained elsewhere, for the vehicle

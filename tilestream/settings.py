@@ -9,10 +9,11 @@ the choice of the model). The options of the command line are made from these fi
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field
 
 from tilestream.config import Settings
 from tilestream.errors import UsageError
+from tilestream.files import local_path, place_of
 from tilestream.records import TruePose
 from tilestream.sensor import SENSORS, Carrier, Sensor, Vehicle, named
 
@@ -22,6 +23,16 @@ Degrees = Annotated[float, Field(ge=0.0, lt=360.0)]
 NAME = r"^[\w][\w .+-]*$"
 Name = Annotated[str, Field(pattern=NAME)]
 """Of a drive: it becomes a folder, so nothing that could lead out of one."""
+
+
+def _file_of(path: str) -> str:
+    return place_of(local_path(path))
+
+
+Place = Annotated[str, AfterValidator(place_of)]
+"""A place to write to or read from: made absolute here, where it enters, or a URL."""
+LocalFile = Annotated[str, AfterValidator(_file_of)]
+"""A file or a glob that is read from a disk, made absolute here."""
 
 
 def bytes_of(amount: object) -> object:
@@ -87,9 +98,9 @@ class IngestSettings(Settings):
 class MapSettings(IngestSettings, LogSettings):
     """The map: what it is made from, and how it is cut into tiles."""
 
-    sources: tuple[str, ...] = ()
+    sources: tuple[LocalFile, ...] = ()
     """Files, globs and map directories; empty with `simulate`: its survey."""
-    store: str | None = None
+    store: Place | None = None
     """Path or URL of the tile store; not given: `map.zarr` in the run directory."""
     partial: bool = False
     """Go on with a map that is half-made or has lost tiles; places that could see a gap say so."""
@@ -98,7 +109,7 @@ class MapSettings(IngestSettings, LogSettings):
 class DriveSettings(LogSettings):
     """A log on which errors are measured, maybe through a degraded sensor."""
 
-    log: str
+    log: LocalFile
     """An MCAP log with point clouds and poses."""
     name: Name | None = None
     """What to call it; not given: the name of its file. Give each drive its own."""
@@ -262,8 +273,8 @@ class SimulateSettings(Settings):
     """Turns of the lidar kept at each sample point."""
     seed: int = 0
     """Seed of everything that is simulated."""
-    folder: str | None = None
-    """Where it is kept; not given: `simulation` in the run directory."""
+    folder: LocalFile | None = None
+    """Where it is kept, on a disk; not given: `simulation` in the run directory."""
 
 
 class ReportSettings(Settings):

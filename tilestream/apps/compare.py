@@ -15,6 +15,7 @@ import pandas as pd
 
 from tilestream.errors import PartialError, UsageError
 from tilestream.factors.rows import in_route_order
+from tilestream.files import place_of
 from tilestream.grid import MM_PER_M, whole_mm
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, paths_of
@@ -198,7 +199,7 @@ def plan_compare(
         observing = Observing(
             choice.sensor, choice.seeing(seeing), registration, choice.cell_size, sensor_height
         )
-        folder = f"{os.fspath(out)}/{choice.name}"
+        folder = f"{place_of(out)}/{choice.name}"
         planned = plan_observe(map_plan, samples, folder, observing, memory, group=choice.name)
         tasks += planned.outputs(observe.name)
     usual_mm = whole_mm(USUAL, "cell_size")

@@ -1,6 +1,5 @@
 """The commands along routes and drives: measure errors, compute factors, compare sensors."""
 
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -21,6 +20,7 @@ from tilestream.cli.tables import (
 )
 from tilestream.errors import PartialError
 from tilestream.factors.catalogue import Which
+from tilestream.files import Files
 from tilestream.pipeline.jobs import along_routes
 from tilestream.pipeline.jobs import localize as localize_drive
 from tilestream.pipeline.jobs.run_inputs import reading_of, scans_of
@@ -258,7 +258,7 @@ def _show_comparison(content: dict[str, Any], store: str, folder: str, as_json: 
         print_json(content)
     else:
         out.print(comparison_table(content))
-        say(f"The page is at {(Path(folder) / 'compare.html').absolute()}")
+        say(f"The page is at {Files.at(folder).under('compare.html').address}")
     if not any(choice["estimated"] for choice in content["choices"]):
         reasons = content["choices"][0]["missing"]
         failures = {str(reason): f"{count} sample points" for reason, count in reasons.items()}

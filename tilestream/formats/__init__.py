@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from tilestream.errors import SourceNotFoundError, UsageError
+from tilestream.files import local_path
 from tilestream.formats.base import Block, PointSource, SourceInfo, Span, corner_of
 from tilestream.formats.drive import DRIVES
 from tilestream.formats.points import autoware, e57, las, pcd, ply
@@ -55,9 +56,9 @@ def open_source(path: str | os.PathLike[str], **options: object) -> PointSource:
         SourceNotFoundError: there is no such file.
         UnknownFormatError: the ending is of no supported format, or the content is of another one.
         CorruptSourceError: the file is empty, cut short or damaged.
-        UsageError: an option that no format takes.
+        UsageError: an option that no format takes, or a file that is not on this machine.
     """
-    name = os.fspath(path)
+    name = local_path(path)
     found = format_of(name, FORMATS)
     known = {option for f in FORMATS for option in f.options}
     if unknown := sorted(options.keys() - known):
@@ -105,12 +106,13 @@ def expand_sources(
     Raises:
         SourceNotFoundError: a file does not exist or a glob matches nothing; names it.
         UnknownFormatError: a directory of no known format.
+        UsageError: a file that is not on this machine.
     """
     if isinstance(patterns, str | os.PathLike):
         patterns = [patterns]
     found: dict[str, str] = {}
     for pattern in patterns:
-        for path in _expand(os.fspath(pattern)):
+        for path in _expand(local_path(pattern)):
             found.setdefault(os.path.realpath(path), path)
     return sorted(found.values())
 

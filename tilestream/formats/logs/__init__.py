@@ -3,6 +3,7 @@
 from functools import lru_cache
 from pathlib import Path
 
+from tilestream.files import local_path
 from tilestream.formats.logs import mcap
 from tilestream.formats.logs.base import MAX_GAP_S, LogOptions, Recording
 from tilestream.formats.logs.mcap_write import write_log
@@ -57,12 +58,13 @@ def open_log(
 
     Raises:
         SourceNotFoundError: no such file.
+        UsageError: a file that is not on this machine.
         UnknownFormatError: a file or directory of no known format; says what is known.
         CorruptSourceError: the log is damaged or contradicts itself; names file and place.
         SourceError: no scans, or several topics that are equally good; names what is there.
         PoseError: no poses, none at the time of any scan, or several topics that are equally good.
     """
-    name = str(path)
+    name = local_path(path)
     topics = [None] if points_topic is None else [part.strip() for part in points_topic.split(",")]
     found, state = format_of(name, LOG_FORMATS), state_of(name)
     logs = [

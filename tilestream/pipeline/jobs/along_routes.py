@@ -10,6 +10,7 @@ from tilestream.crs import require_same
 from tilestream.errors import PartialError
 from tilestream.factors.catalogue import Which
 from tilestream.factors.rows import Samples, in_route_order, samples_by_tile
+from tilestream.files import place_of
 from tilestream.grid import TileKey, whole_mm
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, paths_of
@@ -116,7 +117,7 @@ def plan_factors(
         memory: what a task may use [bytes].
     """
     map_plan.store.grid.require_cell_size(whole_mm(looking.cell_size, "cell_size"))
-    folder = os.fspath(out)
+    folder = place_of(out)
     tasks = [factors_task(map_plan, key, some, looking, folder) for key, some in samples.items()]
     return Plan.of((*map_plan.tasks.values(), *tasks), memory)
 
@@ -201,7 +202,7 @@ def plan_observe(
         applies: `observe`, or `observe_drive`.
     """
     map_plan.store.grid.require_cell_size(whole_mm(observing.cell_size, "cell_size"))
-    folder = os.fspath(out)
+    folder = place_of(out)
     tasks = [
         observe_task(map_plan, key, some, observing, folder, group, applies)
         for key, some in samples.items()

@@ -3,13 +3,13 @@
 import os
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from tilestream.errors import PartialError, TileNotReadyError, UsageError
+from tilestream.files import local_path, place_of
 from tilestream.formats.logs import ScanLog, ScanSelection
 from tilestream.formats.motion import along
 from tilestream.grid import Box, TileKey, whole_mm
@@ -150,7 +150,7 @@ def plan_localize(
             tiles_in_reach(map_plan, places[[sample.scan for sample in part]], reach),
             DriveScans(reading, state, part),
             measuring,
-            os.fspath(out),
+            place_of(out),
             group,
             starts_per_task,
         )
@@ -159,7 +159,7 @@ def plan_localize(
 
 def _absolute(reading: Reading) -> Reading:
     """With the whole path: workers may run elsewhere."""
-    return replace(reading, path=str(Path(reading.path).absolute()))
+    return replace(reading, path=place_of(local_path(reading.path)))
 
 
 def choose_samples(log: ScanLog, scans: ScanSelection, spacing: float) -> tuple[Sample, ...]:

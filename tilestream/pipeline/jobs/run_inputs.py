@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from tilestream.errors import ModelError, SourceNotFoundError, UsageError
+from tilestream.files import Files
 from tilestream.formats.logs import ScanSelection, is_log
 from tilestream.formats.routes import RoutesRead, read_all_routes, together
 from tilestream.model.dataset import made_with
@@ -139,9 +140,16 @@ ATTRIBUTION = (
 
 
 def simulated_folder(settings: RunSettings) -> Path:
-    """Where a simulated city is kept."""
+    """Where a simulated city is kept.
+
+    Raises:
+        UsageError: nowhere on a disk.
+    """
     assert settings.simulate is not None
-    return Path(settings.simulate.folder or settings.folder / "simulation")
+    folder = settings.simulate.folder
+    if folder is None and not settings.folder.local:
+        raise UsageError(f"{settings.out}: a city is simulated to a disk: give simulate.folder")
+    return Path(folder or f"{settings.out}/simulation")
 
 
 LANES = "lanelet2_map.osm"
@@ -317,7 +325,7 @@ def check_model(settings: RunSettings) -> None:
     """
     if settings.model.use is None:
         return
-    if not Path(settings.model.use).is_file():
+    if not Files.at(settings.model.use).there():
         raise SourceNotFoundError(f"{settings.model.use}: no such model file; see model.use")
     try:
         check_making(load_model(settings.model.use), making_of(settings))

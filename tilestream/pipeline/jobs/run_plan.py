@@ -226,7 +226,7 @@ def _training(settings: RunSettings, joined: Task) -> Task:
     return Task(
         train,
         "model",
-        ModelFile(str(settings.folder / "model.skops")),
+        ModelFile(f"{settings.out}/model.skops"),
         takes={"recipe": settings.model.recipe, "seed": settings.model.seed},
         reads={"dataset": joined.product},
         counts=joined.counts,

@@ -11,12 +11,15 @@ from pydantic import AfterValidator, Field, ValidationError, model_validator
 from tilestream.bounded_yaml import parse_yaml, read_yaml
 from tilestream.config import Settings
 from tilestream.errors import SourceNotFoundError, UsageError, foreign_errors
+from tilestream.files import Files, local_path
 from tilestream.model.registry import COMPETITORS, DEFAULT, RECIPES, UNTRAINED
 from tilestream.settings import (
     NAME,
     DriveSettings,
     LabelSettings,
+    LocalFile,
     MapSettings,
+    Place,
     PlaceSettings,
     ReportSettings,
     SimulateSettings,
@@ -48,7 +51,7 @@ class ModelSettings(Settings):
     recipe: Recipe = DEFAULT
     offset: Annotated[float, Field(ge=0.0)] = 0.0
     """With `physics`: what a real scan adds to the error of a virtual one [m]."""
-    use: str | None = None
+    use: Place | None = None
     """A model file to use instead of training; null: train on the drives."""
     seed: int = 0
     """Seed of all that is random in training."""
@@ -62,15 +65,15 @@ class ModelSettings(Settings):
 class RunSettings(PlaceSettings):
     """The main job: from map and drives to the estimated error of every sample point."""
 
-    out: str
-    """The run directory."""
+    out: Place
+    """The run directory: a path, or a URL of an object store."""
     simulate: SimulateSettings | None = None
     """Simulate a city; null: real files."""
     map: MapSettings = MapSettings()
     """The map."""
     drives: tuple[DriveSettings, ...] = ()
     """The logs to measure on; empty with `simulate`: its drives."""
-    routes: tuple[str, ...] = ()
+    routes: tuple[LocalFile, ...] = ()
     """Files of routes to estimate along; empty: those of the simulation, or of the drives; without
     drives, all lanes of a map directory with `lanelet2_map.osm` among the sources."""
     observe: VirtualSettings | None = VirtualSettings()
@@ -107,14 +110,14 @@ class RunSettings(PlaceSettings):
         return self
 
     @property
-    def folder(self) -> Path:
+    def folder(self) -> Files:
         """The run directory."""
-        return Path(self.out)
+        return Files.at(self.out)
 
     @property
     def store_url(self) -> str:
         """Where the tile store is."""
-        return self.map.store or str(self.folder / "map.zarr")
+        return self.map.store or f"{self.out}/map.zarr"
 
 
 def read_settings(path: str | os.PathLike[str], changes: Sequence[str] = ()) -> RunSettings:
@@ -129,7 +132,7 @@ def read_settings(path: str | os.PathLike[str], changes: Sequence[str] = ()) -> 
         UsageError: no YAML, an unknown key at any level (names the nearest right one), a value that
             cannot be.
     """
-    place = Path(path)
+    place = Path(local_path(path))
     if not place.is_file():
         raise SourceNotFoundError(f"{place}: no such config; `tilestream template` prints one")
     values = read_yaml(place, UsageError)
