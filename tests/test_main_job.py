@@ -627,7 +627,7 @@ def test_the_template_is_a_job_and_explains_every_setting(
     assert command(["template"]) == 0
     text = capsys.readouterr().out
     (tmp_path / "job.yaml").write_text(text)
-    assert read_settings(tmp_path / "job.yaml").out == "my-city"
+    assert read_settings(tmp_path / "job.yaml").out == str(Path("my-city").absolute())
     groups = [RunSettings, SimulateSettings, MapSettings, DriveSettings, VirtualSettings]
     groups += [LabelSettings, ModelSettings, ReportSettings]
     settings = {name for group in groups for name in group.model_fields}

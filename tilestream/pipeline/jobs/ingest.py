@@ -99,7 +99,13 @@ def ingest(
     )
     with only_writer(url):
         reading = read_sources(sources, url, settings, memory, points_topic, pose_topic, scans)
-        outcomes = execute(reading.first(), client, watch, grow=lambda o: reading.grown(o) or ())
+        outcomes = execute(
+            reading.first(),
+            client,
+            watch,
+            grow=lambda outcome: reading.grown(outcome) or (),
+            shared=[reading.store.url],
+        )
         failures = reading.close(outcomes)
     if failures:
         raise PartialError(

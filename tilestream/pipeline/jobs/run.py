@@ -111,7 +111,9 @@ def _run(settings: RunSettings, client: Any | None, watch: Watch | None) -> None
             book.failures |= inputs.failures
             book.facts["notes"] = [*inputs.notes, *_on_degraded(settings, inputs)]
             story = _Story(settings, inputs, book)
-            execute(story.first(), client, book.listening(watch), grow=story.grown)
+            shared = [settings.out, story.store.url]
+            first = story.first()
+            execute(first, client, book.listening(watch), grow=story.grown, shared=shared)
             if story.estimate is None:
                 story.estimate = story.plan_estimate()
                 book.tasks += story.estimate.tasks

@@ -96,7 +96,7 @@ def simulate(
         check_clear(street, city.footprints)
     with only_writer(folder):
         _begin(folder, city, identity)
-        outcomes = execute(plan, client, watch)
+        outcomes = execute(plan, client, watch, shared=[str(folder)])
         failures = {outcome.key: outcome.reason for outcome in outcomes if not outcome.ok}
         for name in ("", "survey", f"logs/drive{settings.drive}"):
             Files.at(folder).under(name).remove_parts()
