@@ -89,7 +89,7 @@ def test_a_store_that_the_workers_do_not_see_is_named_once(
     workers: distributed.Client, cloud: Path
 ) -> None:
     url = f"memory://{uuid.uuid4().hex}/map.zarr"
-    with pytest.raises(UsageError, match="does not see memory:///.*all workers see") as told:
+    with pytest.raises(UsageError, match=r"does not see memory:///.*all workers see") as told:
         ts.ingest(cloud, url, client=workers)
     assert "\n" not in str(told.value)
     assert not [name for name in Files.at(url).names() if "seen" in name]
