@@ -8,7 +8,7 @@ import typer
 
 from tilestream.cli.printing import err, say
 from tilestream.errors import PartialError, UsageError
-from tilestream.formats.routes import RoutesRead, read_all_routes, together
+from tilestream.formats.routes import RoutesRead, read_all_routes, read_each
 
 StoreUrl = Annotated[str, typer.Argument(help="The tile store.")]
 Routes = Annotated[list[str], typer.Option(help="TUM, KITTI, CSV, GeoJSON, Lanelet2 or MCAP.")]
@@ -45,8 +45,8 @@ def routes_of(
         PartialError: when all is done with the good ones, some cannot be used; lists them, with
             what else failed.
     """
-    read = together(read_all_routes(path, project_to=project_to, map_crs=map_crs) for path in files)
-    read = read.at_least(spacing)
+    how = {"project_to": project_to, "map_crs": map_crs}
+    read = read_each(((path, how) for path in files), read_all_routes).at_least(spacing)
     for note in read.notes:
         say(note, to=err)
     try:

@@ -46,7 +46,7 @@ from tilestream.store.arrays import (
 from tilestream.store.condition import Condition as Condition
 from tilestream.store.manifest import Manifest as Manifest
 from tilestream.store.manifest import read_manifest, remove_other_manifests
-from tilestream.store.record import Record, State, read_record, write_record
+from tilestream.store.record import Record, State, read_record, source_of, way_of, write_record
 from tilestream.store.record import StoreSettings as StoreSettings
 from tilestream.store.table import CELLS_VERSION as CELLS_VERSION
 from tilestream.store.table import TileTable as TileTable
@@ -240,7 +240,7 @@ class TileStore:
 
         Empty until an ingest has ended.
         """
-        return [dict(source) for source in read_record(self.url).sources]
+        return [source_of(self.files, source) for source in read_record(self.url).sources]
 
     def made_by(self) -> dict[str, int]:
         """The stages that made the map, with their versions; empty until an ingest has ended."""
@@ -270,7 +270,8 @@ class TileStore:
 
         A map whose tiles were never known is not whole by that.
         """
-        record = replace(read_record(self.url), sources=sources, made_by=made_by)
+        known = [{**source, "way": way_of(self.files, source["path"])} for source in sources]
+        record = replace(read_record(self.url), sources=known, made_by=made_by)
         self._write(record if record.manifest is None else replace(record, state="whole"))
 
     def forget(self) -> None:

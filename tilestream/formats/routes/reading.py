@@ -220,6 +220,8 @@ def _drawn(path: str, pose_topic: str | None, points_topic: str | None) -> Seque
                 stamps_s=(poses.stamps_ns - poses.stamps_ns[0]) / 1e9,
             )
         ]
+    if Path(path).is_dir():
+        raise UnknownFormatError(f"{path}: a directory; give the files of routes in it")
     if not Path(path).is_file():
         raise SourceNotFoundError(f"{path}: no such file; check the path")
     if ending not in READERS:

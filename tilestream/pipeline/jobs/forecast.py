@@ -56,7 +56,8 @@ def forecast(settings: RunSettings) -> Forecast:
     measure = plan_measure(settings, inputs, map_plan)
     done = [Outcome(task.key, task.stage) for task in measure.tasks]
     estimate = plan_estimate(settings, map_plan.store.grid, measure, done)
-    return Forecast((*reading, *measure.tasks, *estimate.tasks), (*notes, *inputs.notes))
+    lost = (f"{name} is left out: {reason}" for name, reason in measure.left_out.items())
+    return Forecast((*reading, *measure.tasks, *estimate.tasks), (*notes, *inputs.notes, *lost))
 
 
 def _simulation_first(settings: RunSettings, wanted: SimulateSettings) -> Forecast:

@@ -309,7 +309,12 @@ def _create_or_resume(url: str, settings: IngestSettings, found: Sequence[Source
                 f"{url} has {name} {there!r}, asked for is {value!r}: "
                 "use the same setting, or another path for the new store"
             )
-    forgotten = sorted({s["path"] for s in store.sources()} - {s.path for s in found})
+    given = {os.path.realpath(source.path) for source in found}
+    forgotten = sorted(
+        source["path"]
+        for source in store.sources()
+        if os.path.realpath(source["path"]) not in given
+    )
     if forgotten:
         raise UsageError(
             f"{url} was also made from {', '.join(forgotten)}: give all sources of the map, "
@@ -325,8 +330,10 @@ def _fits(asked: str | None, there: str | None) -> bool:
 
 def _is_current(store: TileStore, found: Sequence[Source]) -> bool:
     """Whether the store is whole, and made from exactly these sources by these stages."""
-    recorded = {(s["path"], s["state"]) for s in store.sources() if not s["reason"]}
-    if recorded != {(s.path, s.state) for s in found} or store.made_by() != MADE_BY:
+    known = {(s["path"], s["state"]) for s in store.sources() if not s["reason"]}
+    now = {(source.path, source.state) for source in found}
+    recorded, given = ({(os.path.realpath(p), s) for p, s in some} for some in (known, now))
+    if recorded != given or store.made_by() != MADE_BY:
         return False
     condition = store.condition()
     return condition.whole and all(mark.status == "done" for mark in condition.marks.values())

@@ -86,8 +86,8 @@ def run(
         PlanError: a task does not fit `memory`.
         LockedError: another process writes to the run directory, or to the map that is made.
         IncompleteError: the map that is there is not whole, and not `map.partial`.
-        PartialError: some tasks failed, or some routes cannot be used; the message lists them, the
-            rest is done and reported.
+        PartialError: some tasks failed, or some sources, drives or routes cannot be used; the
+            message lists them, the rest is done and reported.
     """
     settings = config if isinstance(config, RunSettings) else read_settings(config)
     check_model(settings)
@@ -217,6 +217,7 @@ class _Story:
     def _measured(self, map_plan: MapPlan) -> tuple[Task, ...]:
         """The tasks that measure; tables of other settings are removed before."""
         self.measure = plan_measure(self.settings, self.inputs, map_plan)
+        self.book.failures |= self.measure.left_out
         announce(self.measure.tasks)
         _remove_other_groups(self.settings, self.measure)
         self._open = {task.key for task in self.measure.tasks}

@@ -1,5 +1,6 @@
 """What the main job works on: its settings and files."""
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from glob import glob
@@ -9,13 +10,13 @@ from typing import Any
 from tilestream.errors import ModelError, SourceNotFoundError, UsageError
 from tilestream.files import Files
 from tilestream.formats.logs import ScanSelection, is_log
-from tilestream.formats.routes import RoutesRead, read_all_routes, together
+from tilestream.formats.routes import RoutesRead, read_all_routes, read_each
 from tilestream.model.dataset import made_with
 from tilestream.model.file import load_model
 from tilestream.model.training import check_making
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.jobs.ingest import Reading, read_sources
-from tilestream.pipeline.jobs.run_settings import RunSettings
+from tilestream.pipeline.jobs.run_settings import RunSettings, one_of_each
 from tilestream.pipeline.jobs.simulate import simulate
 from tilestream.pipeline.jobs.sources import crs_of_map
 from tilestream.pipeline.stages.drive_scans import Reading as DriveReading
@@ -61,12 +62,12 @@ def inputs_of(settings: RunSettings, client: Any | None, watch: Watch | None) ->
         SourceError: a file that is not there, or none of the routes can be used.
     """
     if settings.simulate is None:
-        drives = settings.drives
+        drives, again = one_of_each(settings.drives)
         files = settings.routes or tuple(dict.fromkeys(drive.log for drive in drives))
         if not files:
             return _inputs(settings.map.sources, drives, *_all_streets(settings))
         read = _routes(files, settings, settings.map.sources)
-        notes = tuple(_other_lidars(settings))
+        notes = (*again, *_other_lidars(settings))
         return _inputs(settings.map.sources, drives, read.at_least(settings.spacing), notes)
     folder = simulated_folder(settings)
     wanted = settings.simulate
@@ -190,14 +191,13 @@ def _routes(files: Sequence[str], settings: RunSettings, sources: Sequence[str])
     from these sources.
     """
     map_crs = crs_of_map(sources, settings.store_url, settings.map.crs)
-    of_log = {drive.log: drive for drive in reversed(settings.drives)}
-    parts = []
+    of_log = {os.path.realpath(drive.log): drive for drive in reversed(settings.drives)}
+    wanted = []
     for path in files:  # the way of a drive is that of its own poses
-        drive = of_log.get(path)
+        drive = of_log.get(os.path.realpath(path))
         topics = {} if drive is None else drive.model_dump(include={"pose_topic", "points_topic"})
-        project_to = settings.project_to
-        parts.append(read_all_routes(path, project_to=project_to, map_crs=map_crs, **topics))
-    return together(parts)
+        wanted.append((path, {"project_to": settings.project_to, "map_crs": map_crs, **topics}))
+    return read_each(wanted, read_all_routes)
 
 
 def read_map(settings: RunSettings, inputs: Inputs) -> Reading | None:
@@ -340,7 +340,7 @@ def reading_of(drive: DriveSettings) -> DriveReading:
     Raises:
         SourceNotFoundError: there is no such log.
     """
-    if not Path(drive.log).is_file():
+    if not Path(drive.log).exists():
         raise SourceNotFoundError(f"{drive.log}: no such log")
     return DriveReading(
         drive.log,

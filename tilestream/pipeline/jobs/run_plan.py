@@ -1,10 +1,12 @@
 """What the main job runs: tiles, factors and errors; then what is learnt of them."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from tilestream.errors import SourceError, SourceNotFoundError, TileNotReadyError
 from tilestream.factors import catalogue
 from tilestream.factors.rows import Samples
 from tilestream.factors.virtual_drive import NEIGHBOURS
@@ -40,6 +42,7 @@ from tilestream.pipeline.stages.observe import observe_drive
 from tilestream.pipeline.stages.predict import predict
 from tilestream.pipeline.stages.samples import COLUMNS, DatasetFile, samples
 from tilestream.pipeline.stages.train import ModelFile, ModelInUse, train
+from tilestream.settings import DriveSettings
 
 OPPONENT = Median.name
 """What the estimates of a part of the error are compared with: the others know no more of unseen
@@ -58,50 +61,75 @@ def plan_measure(settings: RunSettings, inputs: Inputs, map_plan: MapPlan) -> Pl
         settings: the job.
         inputs: its files.
         map_plan: the map, as far as it is there or will be.
+
+    Returns:
+        The plan; a drive whose log cannot be read is left out, as long as another can.
+
+    Raises:
+        SourceNotFoundError: there is no such log.
+        SourceError, TileNotReadyError: no drive can be measured; says why the first cannot.
     """
     tables = f"{settings.out}/tables"
     looking = Looking(settings.looking_sensor, settings.cell_size, "all", settings.sensor_height)
     places = samples_along(map_plan.store, inputs.routes, settings.spacing)
     memory = settings.memory
+    localized, left_out = _localized(settings, inputs, map_plan, tables)
+    good = [drive for drive in inputs.drives if drive.group in localized]
     plans = [plan_factors(map_plan, places, tables, looking, memory)]
     if settings.observe is not None:
         observing = observing_of(settings, settings.observe)
         plans.append(plan_observe(map_plan, places, tables, observing, memory))
-        plans += _observed_drives(settings, inputs, map_plan, places)
-    plans += [
-        plan_localize(
-            map_plan,
-            reading_of(drive),
-            tables,
-            cell_size=settings.cell_size,
-            spacing=settings.spacing,
-            registration=settings.label.registration,
-            starts=settings.label.starts,
-            true_pose=settings.label.true_pose,
-            scans=scans_of(drive),
-            starts_per_task=None,
-            memory=memory,
-            group=drive.group,
-        )
-        for drive in inputs.drives
-    ]
-    return Plan.of((task for plan in plans for task in plan.tasks), memory)
+        plans += _observed_drives(settings, good, map_plan, places)
+    plans += localized.values()
+    measured = Plan.of((task for plan in plans for task in plan.tasks), memory)
+    return replace(measured, left_out=left_out)
+
+
+def _localized(
+    settings: RunSettings, inputs: Inputs, map_plan: MapPlan, tables: str
+) -> tuple[dict[str, Plan], dict[str, str]]:
+    """What measures each drive, by its name, and why others cannot be measured."""
+    plans: dict[str, Plan] = {}
+    errors: dict[str, SourceError | TileNotReadyError | OSError] = {}
+    for drive in inputs.drives:
+        try:
+            plans[drive.group] = plan_localize(
+                map_plan,
+                reading_of(drive),
+                tables,
+                cell_size=settings.cell_size,
+                spacing=settings.spacing,
+                registration=settings.label.registration,
+                starts=settings.label.starts,
+                true_pose=settings.label.true_pose,
+                scans=scans_of(drive),
+                starts_per_task=None,
+                memory=settings.memory,
+                group=drive.group,
+            )
+        except SourceNotFoundError:
+            raise
+        except (SourceError, TileNotReadyError, OSError) as error:
+            errors[f"drive {drive.group}"] = error
+    if errors and not plans:
+        raise next(iter(errors.values()))
+    return plans, {name: str(error) for name, error in errors.items()}
 
 
 def _observed_drives(
     settings: RunSettings,
-    inputs: Inputs,
+    drives: Sequence[DriveSettings],
     map_plan: MapPlan,
     places: Mapping[TileKey, Samples],
 ) -> Iterator[Plan]:
     """The labelled places of drives that are read as another lidar than the vehicle's, as seen by
     that one.
     """
-    for name, observing in degraded_drives(settings, inputs.drives).items():
+    for name, observing in degraded_drives(settings, drives).items():
         labelled = np.concatenate(
             [
                 labelled_places(reading_of(drive), scans_of(drive), settings.spacing)
-                for drive in inputs.drives
+                for drive in drives
                 if drive.degraded == name
             ]
         )

@@ -94,7 +94,7 @@ class RunSettings(PlaceSettings):
                     f"has a drive that {drive.log!r} cannot name: give it a name of letters, digits"
                     " and _ . + - or spaces, the first a letter, a digit or _"
                 )
-        names = [drive.group for drive in self.drives]
+        names = [drive.group for drive in one_of_each(self.drives)[0]]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise ValueError(f"has two drives named {', '.join(twice)}: give each its own name")
@@ -118,6 +118,22 @@ class RunSettings(PlaceSettings):
     def store_url(self) -> str:
         """Where the tile store is."""
         return self.map.store or f"{self.out}/map.zarr"
+
+
+def one_of_each(drives: Sequence[DriveSettings]) -> tuple[tuple[DriveSettings, ...], list[str]]:
+    """The drives without those that are another one again, whatever the name of drive and log, and
+    a note on each of these.
+    """
+    first: dict[tuple[str, str], DriveSettings] = {}
+    notes = []
+    for drive in drives:
+        how = drive.model_dump_json(exclude={"log", "name"})
+        before = first.setdefault((os.path.realpath(drive.log), how), drive)
+        if before is not drive:
+            notes.append(
+                f"Drive {drive.group}, {drive.log}, is drive {before.group} again: measured once."
+            )
+    return tuple(first.values()), notes
 
 
 def read_settings(path: str | os.PathLike[str], changes: Sequence[str] = ()) -> RunSettings:

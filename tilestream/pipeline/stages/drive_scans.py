@@ -1,8 +1,9 @@
 """The scans of a drive as a task reads them, as if by the sensor that is asked for."""
 
 import math
+import os
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -66,8 +67,11 @@ class Reading:
 
     @property
     def state(self) -> str:
-        """Hash of the log as it is now, and of how it is read."""
-        return hash_of(self, *state_of(self.path))
+        """Hash of the log as it is now, and of how it is read; wherever it lies: a job whose files
+        have moved has not to measure anew.
+        """
+        known = replace(self, path=os.path.basename(os.path.realpath(self.path)))  # noqa: PTH119
+        return hash_of(known, *state_of(self.path))
 
     def open(self) -> ScanLog:
         """The log."""
