@@ -33,6 +33,7 @@ from tilestream.formats.points.las import write_las
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.pipeline.engine import plan
 from tilestream.pipeline.jobs import ingest as ingest_map
+from tilestream.pipeline.jobs import sources
 from tilestream.pipeline.stages import merge, scatter
 from tilestream.settings import IngestSettings
 from tilestream.store import POINTS
@@ -118,7 +119,7 @@ def test_any_tile_and_block_size_stores_the_points_of_the_definition(
     write_pcd(tmp_path / "b.pcd", cloud[500:])
     monkeypatch.setattr(scatter, "MAX_BLOCK_POINTS", block)
     monkeypatch.setattr(scatter, "MIN_BLOCK_POINTS", block)
-    monkeypatch.setattr(ingest_map, "POINTS_PER_TASK", span)
+    monkeypatch.setattr(sources, "POINTS_PER_TASK", span)
     url = tmp_path / "map.zarr"
     shutil.rmtree(url, ignore_errors=True)
     store = ts.ingest([tmp_path / "b.pcd", tmp_path / "a.pcd"], url, tile_size=tile, map_leaf=leaf)
@@ -410,7 +411,7 @@ def test_what_is_a_stray_does_not_depend_on_how_a_source_is_read(
     cloud[::300] = 0.0
     write_pcd(tmp_path / "a.pcd", cloud)
     whole = ts.ingest(tmp_path / "a.pcd", tmp_path / "a.zarr")
-    monkeypatch.setattr(ingest_map, "POINTS_PER_TASK", 300)
+    monkeypatch.setattr(sources, "POINTS_PER_TASK", 300)
     split = ts.ingest(tmp_path / "a.pcd", tmp_path / "b.zarr")
     assert split.identities() == whole.identities()
     assert split.sources()[0]["notes"] == whole.sources()[0]["notes"]

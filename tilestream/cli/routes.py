@@ -6,10 +6,10 @@ import typer
 
 from tilestream.apps import compare as comparing
 from tilestream.cli.cluster import HERE, Cluster, on_cluster
-from tilestream.cli.fields import fields, with_settings
+from tilestream.cli.fields import fields, was_given, with_settings
 from tilestream.cli.maps import LOG_FIELDS
 from tilestream.cli.options import AsJson, DryRun, Routes, StoreUrl, numbers, routes_of
-from tilestream.cli.printing import out, print_json, say
+from tilestream.cli.printing import err, out, print_json, say
 from tilestream.cli.progress import progress
 from tilestream.cli.tables import (
     comparison_table,
@@ -21,6 +21,7 @@ from tilestream.cli.tables import (
 from tilestream.errors import PartialError
 from tilestream.factors.catalogue import Which
 from tilestream.files import Files
+from tilestream.matcher import RegistrationSettings
 from tilestream.pipeline.jobs import along_routes
 from tilestream.pipeline.jobs import localize as localize_drive
 from tilestream.pipeline.jobs.run_inputs import reading_of, scans_of
@@ -34,7 +35,6 @@ from tilestream.settings import (
     LabelSettings,
     MapSettings,
     PlaceSettings,
-    RegistrationSettings,
     ReportSettings,
     StartSettings,
     VirtualSettings,
@@ -75,9 +75,10 @@ def localize(
     cluster: Cluster = HERE,
 ) -> None:
     """Measure the localization error along a drive: 317 registrations per sample point."""
-    registration = labels.registration.model_copy(update={"scan_leaf": leaf.scan_leaf})
+    given = {name: getattr(leaf, name) for name in leaf.model_fields_set}
+    registration = labels.registration.model_copy(update=given)
     how: dict[str, Any] = {
-        "cell_size": places.cell_size,
+        "cell_size": places.cells_for(registration),
         "spacing": places.spacing,
         "registration": registration,
         "starts": starts,
@@ -86,6 +87,8 @@ def localize(
         "starts_per_task": starts_per_task,
         "memory": places.memory,
     }
+    for note in registration.notes:
+        say(note, to=err)
     opened, reading = open_store(store), reading_of(drive)
     if dry_run:
         out.print(
@@ -177,6 +180,7 @@ def factors(
 @on_cluster
 @with_settings
 def compare(
+    context: typer.Context,
     store: StoreUrl,
     route: Routes,
     folder: Annotated[str, typer.Option("--out", help="Folder of the page and the tables.")],
@@ -208,13 +212,17 @@ def compare(
     opened = open_store(store)
     with routes_of(route, places.project_to, places.spacing, opened.settings.crs) as read:
         routes = read.routes
+        registration, height = labels.registration, places.sensor_height
+        for note in registration.notes:
+            say(note, to=err)
+        own = None if was_given(context, "cell_size") else registration.resolution
         choices = comparing.choices_of(
             [sensor_of(name) for name in sensor],
             numbers(ranges, "--range-max") or (None,),
             numbers(blind_rear, "--blind-rear-deg"),
-            numbers(cell_size, "--cell-size"),
+            numbers(cell_size, "--cell-size") if own is None else [own],
         )
-        registration, height = labels.registration, places.sensor_height
+        registration = registration.model_copy(update={"resolution": None})
         if dry_run:
             plan = comparing.plan_compare(
                 opened,

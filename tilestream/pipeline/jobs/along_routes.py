@@ -12,6 +12,7 @@ from tilestream.factors.catalogue import Which
 from tilestream.factors.rows import Samples, in_route_order, samples_by_tile
 from tilestream.files import place_of
 from tilestream.grid import TileKey, whole_mm
+from tilestream.matcher import RegistrationSettings
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, paths_of
 from tilestream.pipeline.engine.stage import Stage
@@ -21,7 +22,7 @@ from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.observe import Observing, observe, observe_task
 from tilestream.records import Route
 from tilestream.sensor import VLP16, Carrier, Sensor
-from tilestream.settings import LabelSettings, RegistrationSettings, VirtualSettings
+from tilestream.settings import LabelSettings, VirtualSettings
 from tilestream.store import TileStore
 from tilestream.tables import read_tables
 
@@ -201,6 +202,7 @@ def plan_observe(
         group: as whose sensor, where one plan observes with several.
         applies: `observe`, or `observe_drive`.
     """
+    observing.registration.require_cells(observing.cell_size)
     map_plan.store.grid.require_cell_size(whole_mm(observing.cell_size, "cell_size"))
     folder = place_of(out)
     tasks = [

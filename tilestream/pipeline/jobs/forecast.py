@@ -57,7 +57,8 @@ def forecast(settings: RunSettings) -> Forecast:
     done = [Outcome(task.key, task.stage) for task in measure.tasks]
     estimate = plan_estimate(settings, map_plan.store.grid, measure, done)
     lost = (f"{name} is left out: {reason}" for name, reason in measure.left_out.items())
-    return Forecast((*reading, *measure.tasks, *estimate.tasks), (*notes, *inputs.notes, *lost))
+    notes += [*inputs.notes, *settings.label.registration.notes, *lost]
+    return Forecast((*reading, *measure.tasks, *estimate.tasks), tuple(notes))
 
 
 def _simulation_first(settings: RunSettings, wanted: SimulateSettings) -> Forecast:

@@ -14,6 +14,7 @@ from tilestream.formats.logs import ScanLog, ScanSelection
 from tilestream.formats.motion import along
 from tilestream.grid import Box, TileKey, whole_mm
 from tilestream.label import start_poses
+from tilestream.matcher import RegistrationSettings
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.engine.outputs import Parquet
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, paths_of
@@ -24,7 +25,7 @@ from tilestream.pipeline.stages.label import label
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.register import MARGIN, Measuring, register
 from tilestream.records import Float64, TruePose
-from tilestream.settings import LabelSettings, RegistrationSettings, StartSettings
+from tilestream.settings import LabelSettings, StartSettings
 from tilestream.store import TileStore
 from tilestream.tables import read_tables
 
@@ -127,6 +128,7 @@ def plan_localize(
 
     Where a job has several logs, `group` names this one's labels: part of their keys and paths.
     """
+    registration.require_cells(cell_size)
     reading = _absolute(reading)
     log = opened(reading)
     samples = choose_samples(log, scans, spacing)

@@ -109,7 +109,11 @@ def _run(settings: RunSettings, client: Any | None, watch: Watch | None) -> None
         with report_kept(client, settings.folder.under("dask-performance.html").address):
             inputs = inputs_of(settings, client, watch)
             book.failures |= inputs.failures
-            book.facts["notes"] = [*inputs.notes, *_on_degraded(settings, inputs)]
+            book.facts["notes"] = [
+                *inputs.notes,
+                *settings.label.registration.notes,
+                *_on_degraded(settings, inputs),
+            ]
             story = _Story(settings, inputs, book)
             shared = [settings.out, story.store.url]
             first = story.first()

@@ -2,9 +2,9 @@
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 
@@ -12,6 +12,7 @@ from tilestream.bounded_yaml import parse_yaml, read_yaml
 from tilestream.config import Settings
 from tilestream.errors import SourceNotFoundError, UsageError, foreign_errors
 from tilestream.files import Files, local_path
+from tilestream.matcher import RegistrationSettings, matcher_named
 from tilestream.model.registry import COMPETITORS, DEFAULT, RECIPES, UNTRAINED
 from tilestream.settings import (
     NAME,
@@ -85,6 +86,30 @@ class RunSettings(PlaceSettings):
     """How they are estimated."""
     report: ReportSettings = ReportSettings()
     """What is reported."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _cells_of_the_matcher(cls, values: Any) -> Any:
+        """The cells that the matcher wants, where it wants some."""
+        label = values.get("label") if isinstance(values, Mapping) else None
+        if isinstance(label, LabelSettings):
+            label = {name: getattr(label, name) for name in label.model_fields_set}
+        if not isinstance(label, Mapping):
+            return values
+        try:
+            matcher = matcher_named(label.get("matcher"))
+        except UsageError:  # which is told where the matcher is
+            return values
+        wanted = matcher.get("resolution") if isinstance(matcher, Mapping) else None
+        wanted = matcher.resolution if isinstance(matcher, RegistrationSettings) else wanted
+        if wanted is None:
+            return values
+        if values.get("cell_size", wanted) != wanted:
+            raise ValueError(
+                f"has cell_size {values['cell_size']} and a matcher of {wanted} m (its resolution):"
+                " leave cell_size out, or give the same"
+            )
+        return {**values, "label": {**label, "matcher": matcher}, "cell_size": wanted}
 
     @model_validator(mode="after")
     def _check(self) -> Self:
