@@ -183,7 +183,10 @@ def test_a_folder_brings_what_is_done_to_a_scan(folder: Path) -> None:
         (folder / "pointcloud_preprocessor" / f"{name}.param.yaml").unlink()
     fewer = LabelSettings(matcher=str(folder)).registration
     assert (fewer.scan_leaf, fewer.random_sample) == (2.0, None)
-    assert sum("left as it is set here" in note for note in fewer.notes) == 2
+    told = " ".join(fewer.notes)
+    assert "thinned to scan_leaf, as it is set here" in told
+    assert "all points of a thinned scan are used" in told
+    assert "not cropped" not in told
 
 
 def test_voxels_that_are_no_cubes_are_refused(folder: Path) -> None:

@@ -16,6 +16,7 @@ from tilestream.errors import PartialError, SourceError, SourceNotFoundError
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.formats.routes import read_all_routes, read_each
 from tilestream.pipeline.engine.plan import Plan
+from tilestream.pipeline.jobs.forecast import forecast
 from tilestream.pipeline.jobs.run_inputs import inputs_of, reading_of
 from tilestream.pipeline.jobs.run_plan import plan_measure
 from tilestream.pipeline.jobs.run_settings import RunSettings
@@ -61,6 +62,27 @@ def test_a_glob_lists_what_is_no_file_and_reads_the_rest(clouds: Path, tmp_path:
     assert sum(source["points"] for source in store.sources()) == 6
     arguments = ["ingest", str(clouds / "*.pcd"), "--store", str(tmp_path / "map.zarr")]
     assert command([*arguments, "--map-leaf", "0"]) == 1
+
+
+def test_a_plan_lists_what_would_be_left_out(
+    clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (clouds / "gone.pcd").symlink_to(tmp_path / "nowhere.pcd")
+    arguments = ["ingest", str(clouds / "*.pcd"), "--store", str(tmp_path / "map.zarr")]
+    assert command([*arguments, "--dry-run"]) == 1
+    told = capsys.readouterr()
+    assert "scatter" in told.out
+    assert "gone.pcd" in told.err
+    assert not (tmp_path / "map.zarr").exists()
+    (tmp_path / "r.csv").write_text("x,y\n0,0\n9,0\n")
+    settings = RunSettings(
+        out=str(tmp_path / "run"),
+        map={"sources": [str(clouds / "*.pcd")]},
+        routes=[str(tmp_path / "r.csv")],
+        model={"recipe": "physics"},
+    )
+    notes = forecast(settings).notes
+    assert sum("gone.pcd is left out: " in note for note in notes) == 1
 
 
 def test_a_source_of_many_names_is_read_once_and_that_is_said(

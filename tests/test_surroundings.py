@@ -7,6 +7,7 @@ import subprocess
 import sys
 import uuid
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import distributed
@@ -97,6 +98,16 @@ def test_a_store_that_the_workers_do_not_see_is_named_once(
 
 def test_workers_see_a_folder_of_this_machine(workers: distributed.Client, tmp_path: Path) -> None:
     require_seen(workers, [str(tmp_path), str(tmp_path)])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_worker_that_is_gone_or_has_no_tilestream(tmp_path: Path) -> None:
+    def client(**answers: object) -> SimpleNamespace:
+        return SimpleNamespace(run=lambda *_, **__: answers)
+
+    require_seen(client(a=OSError("gone"), b=""), [str(tmp_path)])
+    with pytest.raises(UsageError, match="worker a: No module named 'tilestream'"):
+        require_seen(client(a=ImportError("No module named 'tilestream'")), [str(tmp_path)])
     assert list(tmp_path.iterdir()) == []
 
 

@@ -114,13 +114,12 @@ def read_matcher(path: str) -> AutowareMatcher:
     if folder is None:
         told = f"how scans are thinned before is not in this file: its folder, with {BELOW}, has it"
         return AutowareMatcher(found, (*notes, f"{file}: {told}"))
-    for names, read in FILTERS:
+    for names, read, otherwise in FILTERS:
         files = [f for name in names for f in _named(folder, name)]
         if len(files) > 1:
             raise UsageError(f"{files[0]} and {files[1]} both say what one filter does: keep one")
         if not files:
-            told = "what it does is left as it is set here"
-            notes.append(f"{folder}: has no {' or '.join(names)}, {told}")
+            notes.append(f"{folder}: has no {' or '.join(names)}: {otherwise}")
             continue
         settings, more = read(files[0], _parameters(files[0]))
         found |= settings
@@ -203,12 +202,17 @@ def _sample(file: Path, given: Mapping[str, Any]) -> tuple[dict[str, Any], list[
 
 
 Read = Callable[[Path, Mapping[str, Any]], tuple[dict[str, Any], list[str]]]
-FILTERS: tuple[tuple[tuple[str, ...], Read], ...] = (
-    (("crop_box_filter_measurement_range.param.yaml",), _crop),
-    (("voxel_grid_filter.param.yaml", "voxel_grid_downsample_filter.param.yaml"), _voxels),
-    (("random_downsample_filter.param.yaml",), _sample),
+FILTERS: tuple[tuple[tuple[str, ...], Read, str], ...] = (
+    (("crop_box_filter_measurement_range.param.yaml",), _crop, "scans are not cropped"),
+    (
+        ("voxel_grid_filter.param.yaml", "voxel_grid_downsample_filter.param.yaml"),
+        _voxels,
+        "scans are thinned to scan_leaf, as it is set here",
+    ),
+    (("random_downsample_filter.param.yaml",), _sample, "all points of a thinned scan are used"),
 )
-"""The files of the filters, in the order in which a scan goes through them."""
+"""The files of the filters, in the order in which a scan goes through them, and what is done
+without one."""
 
 
 def _parameters(file: Path) -> dict[str, Any]:

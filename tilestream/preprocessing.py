@@ -24,8 +24,8 @@ def preprocessed(points: Float64, settings: RegistrationSettings) -> Float64:
 
     Args:
         points: (n, 3) in the lidar frame [m], finite.
-        settings: the matcher: `crop`, `range_min`, `range_max`, `scan_leaf`, `random_sample`, in this
-            order.
+        settings: the matcher: `crop`, `range_min`, `range_max`, `scan_leaf`, `random_sample`, in
+            this order.
 
     Returns:
         (m, 3) points, sorted by voxel, or by x, y, z where `scan_leaf` is 0.

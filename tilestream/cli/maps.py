@@ -43,6 +43,8 @@ def ingest(
             sources, store, settings, allowed, how.points_topic, how.pose_topic, scans
         )
         out.print(plan_table(plan))
+        if plan.left_out:
+            raise PartialError(f"{store}: sources that would be left out:", dict(plan.left_out))
         return
     failed: PartialError | None = None
     with cluster.client(allowed) as client, progress() as watch:

@@ -41,19 +41,27 @@ def require_seen(client: Any, places: Sequence[str]) -> None:
     try:
         for file in files:
             file.write(probe.encode())
-        told = {file.parent.address: probe for file in files}
-        answers = client.run(_look, told, on_error="return", callback_timeout=ANSWER_WITHIN)
-    except TimeoutError:  # they are busy, and saw it before
-        return
+        answers = _answers(client, {file.parent.address: probe for file in files})
     finally:
         for file in files:
             file.remove()
     for worker, answer in sorted(answers.items()):
-        if answer:
+        if answer and not isinstance(answer, OSError):  # which says that this worker is gone
             raise UsageError(
                 f"worker {worker}: {answer}: inputs, stores and run directories must lie where all "
                 "workers see them under the same name, and all workers need tilestream"
             )
+
+
+def _answers(client: Any, probes: Mapping[str, str]) -> dict[str, Any]:
+    """What `_look` says, by worker; of one that cannot run it the exception; nothing where the
+    workers are busy, or the scheduler is lost, which the run finds out itself.
+    """
+    try:
+        found = client.run(_look, probes, on_error="return", callback_timeout=ANSWER_WITHIN)
+        return dict(found)
+    except (TimeoutError, OSError):
+        return {}
 
 
 def _look(probes: Mapping[str, str]) -> str:

@@ -110,7 +110,8 @@ def _expected_map(
             low, high = (np.round(np.array(corner) * MM_PER_M).astype(int) for corner in bounds)
             box = Box(int(low[0]), int(low[1]), int(high[0]) + 1, int(high[1]) + 1)
             have |= dict.fromkeys(store.grid.keys_over(box), TilePoints("expected", "", 0))
-    notes = [f"at most {len(have)} tiles, by the bounds of the sources; reading tells which"]
+    notes = [f"{path} is left out: {reason}" for path, reason in plan.left_out.items()]
+    notes += [f"at most {len(have)} tiles, by the bounds of the sources; reading tells which"]
     if unknown:
         notes.append(f"only reading tells where the points of {', '.join(unknown[:3])} are")
     return MapPlan(store, have), plan.tasks, notes

@@ -280,15 +280,16 @@ def plan_ingest(
 ) -> Plan:
     """What `ingest` would read first, without running or writing anything.
 
-    The tasks that write tiles are planned from what the reading finds. Arguments and errors as for
-    `ingest`; a source that cannot be opened raises its own error here.
+    The tasks that write tiles are planned from what the reading finds; sources that cannot be
+    opened are left out. Arguments and errors as for `ingest`; where no source can be opened, the
+    error is the first one's.
     """
     found = examine_all(sources, settings, log_options(points_topic, pose_topic, scans))
-    for source in found:
-        if source.reason:
-            raise SourceError(source.reason)
+    left_out = {source.path: source.reason for source in found if source.reason}
+    if len(left_out) == len(found):
+        raise SourceError(found[0].reason)
     store = TileStore(str(url), store_settings(with_crs(settings, found)))
-    return Reading(store, found, memory, current=False).scatters
+    return replace(Reading(store, found, memory, current=False).scatters, left_out=left_out)
 
 
 def _create_or_resume(url: str, settings: IngestSettings, found: Sequence[Source]) -> TileStore:
