@@ -388,3 +388,39 @@ def test_a_command_takes_the_file(
         ts.localize(
             store, inputs / "canyon.mcap", out, registration=RegistrationSettings(resolution=3.0)
         )
+
+
+def test_a_job_takes_the_folder(
+    street: tuple[Path, ts.TileStore], folder: Path, tmp_path: Path
+) -> None:
+    inputs, _ = street
+    (tmp_path / "r.csv").write_text("x,y\n10,0\n13,0\n")
+    settings = ts.RunSettings(
+        out=str(tmp_path / "run"),
+        map={"sources": [str(inputs / "map_canyon.pcd")], "tile_size": 60.0},
+        drives=[{"log": str(inputs / "canyon.mcap"), "until_s": 3.0}],
+        routes=[str(tmp_path / "r.csv")],
+        observe={"starts": 8},
+        label={"matcher": str(folder), "starts": {"radius": 0.2, "step": 0.2}},
+        model={"recipe": "physics"},
+    )
+    ts.run(settings)
+    record = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert any("without effect here" in note for note in record["notes"])
+    report = json.loads((tmp_path / "run" / "report" / "report.json").read_text())
+    matcher = report["facts"]["matcher"]
+    assert (matcher["scan_leaf"], matcher["random_sample"]) == (1.5, 700)
+    assert matcher["crop"]["highest"] == [25.0, 15.0, 9.0]
+    store = ts.open_store(tmp_path / "run" / "map.zarr")
+    assert len(store.keys("cells_3000")) == len(store.keys())
+    assert not store.keys("cells_2000")
+    done = [o.made for o in _outcomes(settings)]
+    assert done
+    assert not any(done)
+
+
+def _outcomes(settings: ts.RunSettings) -> list[Any]:
+    """What became of each task of a job that is run again."""
+    found: list[Any] = []
+    ts.run(settings, watch=lambda outcome, *_: found.append(outcome))
+    return found

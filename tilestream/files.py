@@ -122,6 +122,9 @@ class Files:
         """Its path, or its URL: `at` gives this place again, also elsewhere."""
         return self.root if self.local else str(self.fs.unstrip_protocol(self.root))
 
+    def __fspath__(self) -> str:
+        return self.address
+
     @property
     def name(self) -> str:
         """The last part of it."""
