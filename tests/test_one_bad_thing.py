@@ -12,7 +12,7 @@ from streets import job
 
 import tilestream as ts
 from tilestream.cli import run as command
-from tilestream.errors import PartialError, SourceError, SourceNotFoundError
+from tilestream.errors import PartialError, SourceError, SourceNotFoundError, UsageError
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.formats.routes import read_all_routes, read_each
 from tilestream.pipeline.engine.plan import Plan
@@ -96,16 +96,20 @@ def test_a_source_of_many_names_is_read_once_and_that_is_said(
     (source,) = store.sources()
     assert source["points"] == 3
     assert source["notes"][-1] == f"named 5 times, also as {clouds / 'link.pcd'}: read once"
+    before = made(tmp_path / "map.zarr")
     again = ts.ingest("link.pcd", tmp_path / "map.zarr", map_leaf=0.0)
-    assert again.sources() == [source], "it is known again by any of its names"
+    assert made(tmp_path / "map.zarr") == before, "it is known by any of its names"
+    assert again.sources() == [source | {"path": str(clouds / "link.pcd")}]
 
 
 def made(path: Path) -> dict[str, int]:
-    """When each file of a folder was written."""
+    """When each file below was written, but for the root of a store, which says where sources are
+    now.
+    """
     return {
         str(file.relative_to(path)): file.stat().st_mtime_ns
         for file in path.rglob("*")
-        if file.is_file() and file.name != ".lock"
+        if file.is_file() and file.name != ".lock" and file.parent.suffix != ".zarr"
     }
 
 
@@ -119,6 +123,9 @@ def test_a_map_that_moved_with_its_sources_is_not_made_again(clouds: Path, tmp_p
     assert made(tmp_path / "new") == before
     assert [Path(s["path"]).parent for s in store.sources()] == [tmp_path / "new" / "clouds"] * 2
     assert command(["verify", str(tmp_path / "new" / "map.zarr")]) == 0
+    (tmp_path / "new").rename(tmp_path / "newest")
+    ts.ingest(tmp_path / "newest" / "clouds" / "*.pcd", tmp_path / "newest" / "map.zarr")
+    assert made(tmp_path / "newest") == before
 
 
 def test_a_map_that_moved_without_its_sources_knows_them(clouds: Path, tmp_path: Path) -> None:
@@ -129,6 +136,14 @@ def test_a_map_that_moved_without_its_sources_knows_them(clouds: Path, tmp_path:
     store = ts.ingest(clouds / "*.pcd", tmp_path / "elsewhere" / "map.zarr")
     assert made(Path(store.url)) == before
     assert [Path(source["path"]).parent for source in store.sources()] == [clouds, clouds]
+    clouds.rename(tmp_path / "away")  # the sources without the store
+    store = ts.ingest(tmp_path / "away" / "*.pcd", store.url)
+    assert made(Path(store.url)) == before
+    assert {Path(s["path"]).parent for s in store.sources()} == {tmp_path / "away"}
+    write_pcd(tmp_path / "away" / "good_0.pcd", np.eye(3))
+    shutil.move(tmp_path / "away", tmp_path / "again")
+    with pytest.raises(UsageError, match=r"also made from .*good_0\.pcd"):
+        ts.ingest(tmp_path / "again" / "*.pcd", store.url)
 
 
 def test_a_record_of_before_is_read(clouds: Path, tmp_path: Path) -> None:
@@ -141,6 +156,10 @@ def test_a_record_of_before_is_read(clouds: Path, tmp_path: Path) -> None:
     assert store.sources() == older
     before = made(Path(store.url))
     assert ts.ingest(clouds / "*.pcd", store.url).sources() == older
+    assert made(Path(store.url)) == before
+    write_record(store.files, replace(record, sources=older))
+    clouds.rename(tmp_path / "away")
+    ts.ingest(tmp_path / "away" / "*.pcd", store.url)
     assert made(Path(store.url)) == before
 
 

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, fields, replace
+from pathlib import Path
 from typing import Any
 
 from tilestream.crs import same
@@ -261,7 +262,11 @@ def read_sources(
     options = log_options(points_topic, pose_topic, scans)
     found = within(examine_all(sources, settings, options), memory)
     store = _create_or_resume(str(url), with_crs(settings, found), found)
-    return Reading(store, found, memory, _is_current(store, found))
+    current = _is_current(store, found)
+    recorded = _recorded(store, found)
+    if current and recorded != store.sources():
+        store.end(recorded, MADE_BY)  # the sources have moved, or have other names now
+    return Reading(store, found, memory, current)
 
 
 def store_settings(settings: IngestSettings) -> StoreSettings:
@@ -310,18 +315,32 @@ def _create_or_resume(url: str, settings: IngestSettings, found: Sequence[Source
                 f"{url} has {name} {there!r}, asked for is {value!r}: "
                 "use the same setting, or another path for the new store"
             )
-    given = {os.path.realpath(source.path) for source in found}
-    forgotten = sorted(
-        source["path"]
-        for source in store.sources()
-        if os.path.realpath(source["path"]) not in given
-    )
+    given = {source.path for source in found}
+    forgotten = sorted({s["path"] for s in _recorded(store, found)} - given)
     if forgotten:
         raise UsageError(
             f"{url} was also made from {', '.join(forgotten)}: give all sources of the map, "
             "or another path for the new store"
         )
     return store
+
+
+def _recorded(store: TileStore, found: Sequence[Source]) -> list[dict[str, Any]]:
+    """The sources that a store knows, each under the path that it was found by.
+
+    It is known by the file that the path leads to; where nothing is there any more, by name and
+    state: it has moved.
+    """
+    given = {os.path.realpath(source.path): source.path for source in found}
+    moved = {(Path(source.path).name, source.state): source.path for source in found}
+    known = []
+    for source in store.sources():
+        path = source["path"]
+        now = given.get(os.path.realpath(path))
+        if now is None and not Path(path).exists():
+            now = moved.get((Path(path).name, source["state"]))
+        known.append({**source, "path": now or path})
+    return known
 
 
 def _fits(asked: str | None, there: str | None) -> bool:
@@ -331,10 +350,8 @@ def _fits(asked: str | None, there: str | None) -> bool:
 
 def _is_current(store: TileStore, found: Sequence[Source]) -> bool:
     """Whether the store is whole, and made from exactly these sources by these stages."""
-    known = {(s["path"], s["state"]) for s in store.sources() if not s["reason"]}
-    now = {(source.path, source.state) for source in found}
-    recorded, given = ({(os.path.realpath(p), s) for p, s in some} for some in (known, now))
-    if recorded != given or store.made_by() != MADE_BY:
+    recorded = {(s["path"], s["state"]) for s in _recorded(store, found) if not s["reason"]}
+    if recorded != {(s.path, s.state) for s in found} or store.made_by() != MADE_BY:
         return False
     condition = store.condition()
     return condition.whole and all(mark.status == "done" for mark in condition.marks.values())
