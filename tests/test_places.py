@@ -224,3 +224,34 @@ def test_a_city_is_simulated_to_a_disk(here: Path) -> None:
 def test_a_model_in_an_object_store(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="no such model file"):
         load_model(f"memory://{uuid.uuid4().hex}/model.skops")
+
+
+def test_an_object_store_that_nobody_serves_is_told_in_a_line(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    s3fs = pytest.importorskip("s3fs", reason="needs the extra s3")
+    write_pcd(here / "a.pcd", np.eye(3))
+    for name, value in {
+        "AWS_ENDPOINT_URL": "http://127.0.0.1:9",
+        "AWS_ACCESS_KEY_ID": "test",
+        "AWS_SECRET_ACCESS_KEY": "test",
+        "AWS_MAX_ATTEMPTS": "1",
+        "NO_PROXY": "127.0.0.1",
+    }.items():
+        monkeypatch.setenv(name, value)
+    s3fs.S3FileSystem.clear_instance_cache()
+    monkeypatch.setattr(s3fs.S3FileSystem, "retries", 1)
+    try:
+        assert command(["ingest", "a.pcd", "--store", "s3://bucket/map.zarr"]) == 1
+    finally:
+        s3fs.S3FileSystem.clear_instance_cache()
+    told = " ".join(capsys.readouterr().err.split())
+    assert told.startswith("error: ")
+    assert "s3://bucket/map.zarr" in told
+    assert "cannot be reached (EndpointConnectionError" in told
+
+
+def test_an_empty_path_is_refused(here: Path) -> None:
+    for refused in (lambda: place_of(""), lambda: RunSettings(out="", routes=["r.csv"])):
+        with pytest.raises(UsageError, match="a path is empty"):
+            refused()

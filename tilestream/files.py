@@ -4,6 +4,7 @@ A path is taken as it is: nothing in it is a pattern, and what is removed is nam
 A place has one spelling (`place_of`), which it gets where it enters.
 """
 
+import errno
 import os
 import re
 import shutil
@@ -17,7 +18,7 @@ from typing import Any, BinaryIO, Self
 import fsspec
 from fsspec.implementations.local import LocalFileSystem
 
-from tilestream.errors import UsageError
+from tilestream.errors import TilestreamError, UsageError
 
 PART = re.compile(r"^\..*\.[0-9a-f]{32}\.part$")
 """The name of a file while it is being written."""
@@ -53,6 +54,8 @@ def place_of(url: str | os.PathLike[str]) -> str:
             slash, as `Path("s3://…")` does.
     """
     text = os.fspath(url)
+    if not text:
+        raise UsageError("a path is empty: name a file or a folder")
     path = _local(text)
     if path is None:
         return text.rstrip("/")
@@ -139,6 +142,21 @@ class Files:
         """The folder that it lies in."""
         return type(self)(self.fs, self.root.rsplit("/", 1)[0])
 
+    @contextmanager
+    def _reached(self) -> Iterator[None]:
+        """What a library of an object store raises becomes one error that names the place: no
+        credentials, nobody who answers.
+        """
+        try:
+            yield
+        except (OSError, TilestreamError):
+            raise
+        except Exception as error:
+            if self.local:
+                raise
+            said = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            raise OSError(errno.EIO, f"{self.address} cannot be reached ({said})") from error
+
     def read(self) -> bytes:
         """The bytes of this file.
 
@@ -146,7 +164,8 @@ class Files:
             FileNotFoundError: it is not there.
             OSError: it cannot be read.
         """
-        return bytes(self.fs.cat_file(self.root))
+        with self._reached():
+            return bytes(self.fs.cat_file(self.root))
 
     def read_all(self, names: Sequence[str]) -> list[bytes | None]:
         """The bytes of files below, in one request where that is possible; None: not there.
@@ -157,10 +176,11 @@ class Files:
         if not names:
             return []
         paths = [f"{self.root}/{name}" for name in names]
-        found = self.fs.cat_ranges(paths, None, None, on_error="return")
-        for content in found:
-            if isinstance(content, Exception) and not isinstance(content, FileNotFoundError):
-                raise content
+        with self._reached():
+            found = self.fs.cat_ranges(paths, None, None, on_error="return")
+            for content in found:
+                if isinstance(content, Exception) and not isinstance(content, FileNotFoundError):
+                    raise content
         return [None if isinstance(content, Exception) else bytes(content) for content in found]
 
     def write(self, content: bytes) -> None:
@@ -168,7 +188,8 @@ class Files:
         if self.local:
             with self.writing() as file:
                 file.write(content)
-        else:  # an object appears with its last byte
+            return
+        with self._reached():  # an object appears with its last byte
             self.fs.pipe_file(self.root, content)
 
     @contextmanager
@@ -203,7 +224,8 @@ class Files:
             FileExistsError, NotADirectoryError: a file is in the way.
         """
         if not self.local:
-            self.fs.makedirs(self.root, exist_ok=True)
+            with self._reached():
+                self.fs.makedirs(self.root, exist_ok=True)
             return
         folder = Path(self.root)
         missing = [way for way in (folder, *folder.parents) if not way.exists()]
@@ -213,12 +235,14 @@ class Files:
 
     def there(self) -> bool:
         """Whether this file or folder is there."""
-        return bool(self.fs.exists(self.root))
+        with self._reached():
+            return bool(self.fs.exists(self.root))
 
     def names(self) -> list[str]:
         """The names of what lies in this folder, sorted; none where it is not there."""
         try:
-            entries = self.fs.ls(self.root, detail=False)
+            with self._reached():
+                entries = self.fs.ls(self.root, detail=False)
         except FileNotFoundError:
             return []
         paths = {str(entry).rstrip("/") for entry in entries} - {self.root}
