@@ -48,6 +48,7 @@ import numpy as np
 import pandas as pd
 from model_data import COLUMNS, LENGTHS, dataset, drives
 
+from tilestream.files import Files
 from tilestream.grid import TileKey
 from tilestream.model.file import load_model, save_model
 from tilestream.model.registry import REGRESSORS
@@ -161,7 +162,7 @@ def district(run_dir: Path) -> dict[str, float | str]:
         per_point, per_tile = np.polyfit(points, spent, 1)
         tables = [read(task) for task in tasks]
         done = measured(run_dir, tasks)
-        parquet = Path(folder) / "places.parquet"
+        parquet = Files.at(Path(folder) / "places.parquet")
         gather = seconds(lambda: write_geoparquet(parquet, Findings("all", places_of(done))))
         load = seconds(lambda: load_model(file))
         reading = seconds(lambda: [read(task) for task in tasks])

@@ -32,6 +32,7 @@ from tilestream.formats.points.pcd import write_pcd
 from tilestream.formats.projector import METADATA, PROJECTOR
 from tilestream.formats.routes import read_routes
 from tilestream.marks import Mark
+from tilestream.matcher import RegistrationSettings
 from tilestream.model.file import load_model, save_model
 from tilestream.model.forest import Growth, PaperForest
 from tilestream.model.training import predict, train
@@ -53,6 +54,12 @@ sensor: {name: VLP16, range_max: 60.0}
 label: {matcher: {solver: raw}, starts: {radius: 1.0}}
 observe: {range_max: 40.0}
 memory: 2GB
+"""
+MATCHER = """/**:
+  ros__parameters:
+    frame: {base_frame: base_link}
+    sensor_points: {required_distance: 10.0}
+    ndt: {trans_epsilon: 0.02, step_size: 0.2, resolution: 3.0, max_iterations: 20}
 """
 SENSOR = "- {name: VLP16, range_max: 50.0, mount: {x: 1.0, yaw_deg: 90}}\n- {name: HDL64}\n"
 PRESET = "preset: mine\nlidar:\n  range_max: 75.0\nsurvey:\n  noise: 0.03\n  traffic: 1.0\n"
@@ -131,6 +138,12 @@ def map_directory(path: Path) -> Iterator[object]:
 
 def job(path: Path) -> Iterator[object]:
     yield read_settings(path).model_dump_json()
+
+
+def matcher(path: Path) -> Iterator[object]:
+    found = RegistrationSettings.of_files(str(path))
+    yield found.model_dump(), found.resolution
+    yield [note.replace(str(path), "") for note in found.notes]
 
 
 def sensor(path: Path) -> Iterator[object]:
@@ -302,6 +315,7 @@ READERS = (
     of_routes("Lanelet2", "a.osm", lambda path: osm(path, LANES), bombs=bombs.of_osm),
     Reader("job", "job.yaml", text(JOB), job, bombs=bombs.of_yaml),
     Reader("sensor", "sensor.yaml", text(SENSOR), sensor, bombs=bombs.of_yaml),
+    Reader("matcher", "ndt.param.yaml", text(MATCHER), matcher, bombs=bombs.of_yaml),
     Reader("preset", "preset.yaml", text(PRESET), preset, bombs=bombs.of_yaml),
     Reader("model", "a.skops", write_model, model, in_zip, bombs.of_model),
     in_store("tile values", "*_*/points/c/0"),

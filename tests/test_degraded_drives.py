@@ -50,7 +50,7 @@ def tables(folder: Path) -> pd.DataFrame:
 
 
 def own(run: RunSettings, group: str, kind: str) -> pd.DataFrame:
-    return tables(run.folder / "tables" / "drives" / group / kind)
+    return tables(Path(run.out) / "tables" / "drives" / group / kind)
 
 
 @pytest.mark.parametrize(("group", "range_max"), [("short", SHORT), ("whole", USUAL)])
@@ -58,7 +58,7 @@ def test_a_drive_is_looked_from_where_its_scans_were_taken(
     run: RunSettings, group: str, range_max: float
 ) -> None:
     """With the lidar that it is read as; the factors are of the vehicle's."""
-    labels = tables(run.folder / "tables" / "errors" / group)
+    labels = tables(Path(run.out) / "tables" / "errors" / group)
     observed, factors = own(run, group, "observability"), own(run, group, "factors")
     assert len(labels) > 5
     for table in (observed, factors):
@@ -92,11 +92,11 @@ def test_its_labels_are_joined_with_that_and_the_estimate_is_of_the_vehicle(
         np.testing.assert_array_equal(mine[names], seen.loc[mine.index, names])
         assert set(mine["path"]) == {"canyon"}  # the route is the way of the same log
         np.testing.assert_allclose(mine["arc_length"], seen.loc[mine.index, "arc_length"], atol=0.1)
-    places = pd.read_parquet(run.folder / "report" / "places.parquet").set_index(KEYS)
-    usual = tables(run.folder / "tables" / "observability")
+    places = pd.read_parquet(Path(run.out) / "report" / "places.parquet").set_index(KEYS)
+    usual = tables(Path(run.out) / "tables" / "observability")
     vehicle = averaged_along(usual).set_index(KEYS)["vd_mean"] + OFFSET
     np.testing.assert_array_equal(places["estimate"], vehicle[places.index])
-    report = json.loads((run.folder / "report" / "report.json").read_text())
+    report = json.loads((Path(run.out) / "report" / "report.json").read_text())
     assert any("read as: short;" in note for note in report["notes"]["job"])
 
 
@@ -104,7 +104,7 @@ def test_its_labels_are_joined_with_that_and_the_estimate_is_of_the_vehicle(
 def test_no_estimate_of_the_vehicle_stands_beside_its_labels(
     run: RunSettings, offset: float | None
 ) -> None:
-    places = pd.read_parquet(run.folder / "report" / "places.parquet")
+    places = pd.read_parquet(Path(run.out) / "report" / "places.parquet")
     dataset = ts.dataset(run.folder)
     found = labels_of(dataset, places, None, run.spacing, ["short"], offset).set_index("group")
     short, whole = found.loc["short"], found.loc["whole"]

@@ -29,6 +29,7 @@ from report_json import sources
 
 from tilestream.errors import CrsError, TileNotReadyError, UsageError
 from tilestream.factors import catalogue, observability
+from tilestream.files import Files
 from tilestream.formats import open_source
 from tilestream.model.features import SPREAD_ACROSS, SPREAD_ALONG, WEAK_ALONG
 from tilestream.records import Float64
@@ -134,7 +135,7 @@ def test_every_column_of_the_places_says_what_it_means(tmp_path: Path) -> None:
     for column in columns:
         if column.name not in places:
             places[column.name] = 1.0
-    write_geoparquet(tmp_path / "places.parquet", Findings("t", places))
+    write_geoparquet(Files.at(tmp_path / "places.parquet"), Findings("t", places))
     schema = pq.read_schema(tmp_path / "places.parquet")
     assert {"ob_info_along", "vd_mean", "heading", "route_id"} <= set(schema.names)
     for field in schema:
@@ -167,7 +168,7 @@ def test_csv_is_read_back_to_the_bit(found: Findings, folder: Path) -> None:
 def test_no_text_of_a_csv_is_a_formula_and_numbers_stay(tmp_path: Path) -> None:
     texts = ["=1+1", "+1", "-2", "@sum", "\t=1", "\r=1", "a\r=1", "", None, "'a"]
     numbers = np.linspace(-1.0, 1.0, len(texts))
-    write_csv(tmp_path / "a.csv", pd.DataFrame({"route_id": texts, "x": numbers}))
+    write_csv(Files.at(tmp_path / "a.csv"), pd.DataFrame({"route_id": texts, "x": numbers}))
     with (tmp_path / "a.csv").open(newline="") as file:
         head, *rows = csv.reader(file)
     assert head == ["route_id", "x"]

@@ -33,6 +33,7 @@ from tilestream.label import disc_starts as disc_starts
 from tilestream.label import localization_error as localization_error
 from tilestream.label import refined_pose as refined_pose
 from tilestream.label import start_poses as start_poses
+from tilestream.matcher import RegistrationSettings as RegistrationSettings
 from tilestream.ndt import cells_of as cells_of
 from tilestream.pipeline.jobs.along_routes import factors_along as factors_along
 from tilestream.pipeline.jobs.along_routes import observe_along as observe_along
@@ -48,7 +49,6 @@ from tilestream.sensor import OS1_128 as OS1_128
 from tilestream.sensor import VLP16 as VLP16
 from tilestream.sensor import Sensor as Sensor
 from tilestream.settings import LogOptions as LogOptions
-from tilestream.settings import RegistrationSettings as RegistrationSettings
 from tilestream.settings import StartSettings as StartSettings
 from tilestream.settings import VirtualSettings as VirtualSettings
 from tilestream.store import Tile as Tile

@@ -13,9 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 from tilestream.errors import RegistrationError, UsageError
 from tilestream.grid import MM_PER_M, whole_mm
 from tilestream.kernels.fixed_order import norms
+from tilestream.matcher import RegistrationSettings
 from tilestream.records import Cells, Float64, LocalizationError, TruePose
 from tilestream.registration import register, rigid_poses
-from tilestream.settings import RegistrationSettings, StartSettings
+from tilestream.settings import StartSettings
 
 FAILED = 0.5
 """3D error beyond which a start has failed [m]."""

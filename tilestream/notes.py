@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 Notes = Mapping[str, Sequence[str]]
 """What a user should know, by source: the path of a file, or what else it is about."""
+MATCHER = "matcher"
+"""What notes on the settings of a matcher are about."""
 NUMBER = re.compile(r"\d[\d,.]*")
 """What may differ between notes that are told as one."""
 NAMED = 2

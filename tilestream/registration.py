@@ -1,7 +1,7 @@
 """3D-NDT registration of a scan in the map (definitions, section 5).
 
-A scan is thinned, the cells around it become a local map, and from every start Newton steps are
-taken until one is short.
+A scan is preprocessed, the cells around it become a local map, and from every start Newton steps
+are taken until one is short.
 """
 
 import logging
@@ -11,17 +11,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tilestream.errors import RegistrationError
-from tilestream.grid import MM_PER_M, whole_mm
+from tilestream.grid import MM_PER_M
 from tilestream.kernels.density import magnusson_constants
 from tilestream.kernels.fixed_order import norms
 from tilestream.kernels.neighbour_lists import neighbour_lists
 from tilestream.kernels.registration import Aligned, LocalMap, Rule, align
 from tilestream.kernels.slots import empty_slots
+from tilestream.matcher import RegistrationSettings
+from tilestream.preprocessing import LEAST_POINTS, preprocessed
 from tilestream.records import Cells, Float64, Int64, Registrations
-from tilestream.settings import RegistrationSettings
 
-LEAST_POINTS = 10
-"""Fewest points of a scan that is registered, as given and after thinning."""
 LARGEST_SCAN = 10_000.0
 """Largest distance of a scan point from the lidar [m]; a farther one is in another frame."""
 RIGID = 1e-4
@@ -46,17 +45,18 @@ def register(
     Args:
         cells: cells of the map that cover the scan from every start, and 3 m more (how far the
             steps of a start can lead); others are ignored.
-        scan_points: (n, 3) points in the lidar frame [m], finite. Thinned to `settings.scan_leaf`.
+        scan_points: (n, 3) points in the lidar frame [m], finite. What is done to them before is
+            part of `settings` (`preprocessed`).
         T_map_lidar_starts: (k, 4, 4) start poses, or one (4, 4).
         settings: the matcher; default `RegistrationSettings()`.
 
     Raises:
-        RegistrationError: fewer than 10 points, or after thinning; points or starts that are not
-            finite; starts that are not rigid; no cells near the scan, or a start from which it hits
-            none.
+        RegistrationError: fewer than 10 points, as given or as preprocessed; points or starts that
+            are not finite; starts that are not rigid; no cells near the scan, or a start from which
+            it hits none.
     """
     settings = settings or RegistrationSettings()
-    points = _thinned(_scan(scan_points), settings.scan_leaf)
+    points = preprocessed(_scan(scan_points), settings)
     starts = rigid_poses(T_map_lidar_starts, "start")
     local, origin = _local_map(cells, points, starts, settings)
     corner = np.floor(starts[:, :3, 3] / local.edge).astype(np.int64)
@@ -118,31 +118,6 @@ def _scan(scan_points: ArrayLike) -> Float64:
             f"a scan point lies {reach:.0f} m from the lidar: give points in the lidar frame"
         )
     return points
-
-
-def _thinned(points: Float64, leaf: float) -> Float64:
-    """The centroid of each voxel of the lidar frame's lattice, by voxel index; leaf 0: as given.
-
-    Sums are fixed point (2^-30 m), so the order of the points has no effect. With leaf 0 the points
-    are only sorted.
-    """
-    leaf = whole_mm(leaf, "scan_leaf") / MM_PER_M
-    if leaf == 0.0:
-        return points[np.lexsort(points.T[::-1])]
-    voxel = np.floor(points / leaf)
-    order = np.lexsort(voxel.T[::-1])
-    points, voxel = points[order], voxel[order]
-    begins = np.flatnonzero(np.r_[True, (voxel[1:] != voxel[:-1]).any(axis=1)])
-    if len(begins) < LEAST_POINTS:
-        raise RegistrationError(
-            f"the scan has {len(begins)} points after thinning to {leaf:g} m: "
-            f"give at least {LEAST_POINTS}, or a smaller scan_leaf"
-        )
-    offset = np.rint((points - voxel * leaf) * 2.0**30).astype(np.int64)
-    count = np.diff(np.r_[begins, len(points)])
-    centroid = np.add.reduceat(offset, begins) / count[:, None] / 2.0**30
-    thinned: Float64 = voxel[begins] * leaf + centroid
-    return thinned
 
 
 def rigid_poses(T: ArrayLike, name: str) -> Float64:

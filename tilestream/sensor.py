@@ -14,6 +14,7 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, mod
 from tilestream.bounded_yaml import read_yaml
 from tilestream.config import Settings
 from tilestream.errors import UsageError
+from tilestream.files import local_path
 from tilestream.kernels.fixed_order import turned
 
 Array = NDArray[np.float64]
@@ -308,9 +309,10 @@ def named(given: Any) -> Any:
 
 def _read(path: str) -> Any:
     """The fields of a sensor, or a list of sensors, in a YAML file."""
-    if not Path(path).is_file():
+    file = Path(local_path(path))
+    if not file.is_file():
         raise UsageError(f"{path}: no such sensor or file; known are {', '.join(SENSORS)}")
-    fields = read_yaml(Path(path), UsageError)
+    fields = read_yaml(file, UsageError)
     if not isinstance(fields, dict | list):
         raise UsageError(f"{path}: give the fields of a sensor, e.g. range_max: 100.0")
     return fields

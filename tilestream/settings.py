@@ -1,9 +1,10 @@
 """Every knob of the jobs, once: name, unit, meaning and default.
 
 The YAML file of a job puts them together (`RunSettings` in `pipeline/jobs/run_settings.py`, with
-the choice of the model). The options of the command line are made from these fields
-(`cli/fields.py`), and the keywords of the Python jobs have the same names and defaults
-(tests/test_settings.py). The simulated city has a file of its own (`simulation/settings.py`).
+the choice of the model); those of the matcher are in `matcher.py`. The options of the command line
+are made from these fields (`cli/fields.py`), and the keywords of the Python jobs have the same
+names and defaults (tests/test_settings.py). The simulated city has a file of its own
+(`simulation/settings.py`).
 """
 
 import math
@@ -11,19 +12,30 @@ import reprlib
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from tilestream.config import Settings
 from tilestream.errors import UsageError
+from tilestream.files import local_path, place_of
+from tilestream.matcher import MATCHERS, Positive, RegistrationSettings, matcher_named
 from tilestream.records import RouteZ, TruePose
 from tilestream.sensor import SENSORS, Carrier, Mount, Sensor, Vehicle, named
 
-Positive = Annotated[float, Field(gt=0.0)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Degrees = Annotated[float, Field(ge=0.0, lt=360.0)]
 NAME = r"^[\w][\w .+-]*$"
 Name = Annotated[str, Field(pattern=NAME)]
 """Of a drive: it becomes a folder, so nothing that could lead out of one."""
+
+
+def _file_of(path: str) -> str:
+    return place_of(local_path(path))
+
+
+Place = Annotated[str, AfterValidator(place_of)]
+"""A place to write to or read from: made absolute here, where it enters, or a URL."""
+LocalFile = Annotated[str, AfterValidator(_file_of)]
+"""A file or a glob that is read from a disk, made absolute here."""
 
 
 def bytes_of(amount: object) -> object:
@@ -153,9 +165,9 @@ class IngestSettings(Settings):
 class MapSettings(IngestSettings, LogSettings):
     """The map: what it is made from, and how it is cut into tiles."""
 
-    sources: tuple[str, ...] = ()
+    sources: tuple[LocalFile, ...] = ()
     """Files, globs and map directories; empty with `simulate`: its survey."""
-    store: str | None = None
+    store: Place | None = None
     """Path or URL of the tile store; not given: `map.zarr` in the run directory."""
     partial: bool = False
     """Go on with a map that is half-made or has lost tiles; places that could see a gap say so."""
@@ -164,7 +176,7 @@ class MapSettings(IngestSettings, LogSettings):
 class DriveSettings(LogSettings):
     """A log on which errors are measured, maybe through a degraded sensor."""
 
-    log: str
+    log: LocalFile
     """A log with point clouds and poses: a file, or the folder of a rosbag2."""
     name: Name | None = None
     """What to call it; not given: the name of its file. Give each drive its own."""
@@ -193,69 +205,6 @@ class DriveSettings(LogSettings):
             f"rear{self.blind_rear_deg:.10g}" if self.blind_rear_deg else "",
         )
         return "-".join(part for part in parts if part)
-
-
-class RegistrationSettings(Settings):
-    """The matcher: 3D-NDT as definitions, section 5.1, fixes it. It decides the label."""
-
-    neighbours: Literal["direct1", "direct7", "radius"] = "direct7"
-    """Cells that score a scan point: that of its own voxel, also the six that share a face (Koide,
-    ndt_omp), or all whose mean lies within one cell size (PCL, Autoware)."""
-    solver: Literal["definite", "raw"] = "definite"
-    """Newton step: always climbing (|eigenvalues|, 10 m per rad), or from the Hessian as it is,
-    turned round if it descends (PCL, Autoware, very likely the paper)."""
-    rotation: Literal["exponential", "euler"] = "exponential"
-    """What a rotation step changes: R <- Exp(w) R, or the angles of R = Rx Ry Rz (PCL, Autoware).
-    Either way about the scan's origin."""
-    covariance: Literal["regularised", "seeded"] = "regularised"
-    """Covariance of a cell: regularised (definitions, section 1), or with the identity that PCL and
-    Autoware start their sums from, Sigma + I / (n - 1), eigenvalues at least 0.01 lam1."""
-    step_max: float = Field(default=0.1, gt=0.0)
-    """Longest step, the norm of metres and radians together [m, rad] (Autoware's step_size)."""
-    epsilon: float = Field(default=0.01, gt=0.0)
-    """A start has converged when a step is shorter than this [m, rad] (Autoware's
-    trans_epsilon)."""
-    iterations_max: int = Field(default=30, ge=0, le=10_000)
-    """Most steps of a start (Autoware's max_iterations); 0 scores the starts as they are."""
-    outlier_ratio: float = Field(default=0.55, gt=0.0, lt=1.0)
-    """Share of outliers in Magnusson's density, no unit (PCL's default)."""
-    scan_leaf: float = Field(default=2.0, ge=0.0)
-    """Edge of the voxels of the lidar frame that the scan is thinned to, one centroid each [m]; the
-    paper takes the cell size. A thinned scan is its own thinning. 0 takes the scan as given."""
-
-    @classmethod
-    def autoware(cls, **changes: Any) -> Self:
-        """The production matcher: Autoware's NDT with its default settings.
-
-        Args:
-            changes: fields to set otherwise.
-        """
-        preset = {
-            "neighbours": "radius",
-            "solver": "raw",
-            "rotation": "euler",
-            "covariance": "seeded",
-        }
-        return cls(**(preset | changes))
-
-    @property
-    def told(self) -> str:
-        """The matcher in words: the preset that is nearest to it, and what it has otherwise."""
-        own = self.model_dump()
-        others = {
-            name: {key: own[key] for key, value in known.model_dump().items() if own[key] != value}
-            for name, known in MATCHERS.items()
-        }
-        name = min(others, key=lambda name: len(others[name]))
-        changes = ", ".join(f"{key} {value}" for key, value in others[name].items())
-        return f"{name}, but {changes}" if changes else name
-
-
-MATCHERS = {
-    "autoware": RegistrationSettings.autoware(),
-    "default": RegistrationSettings(),
-}
-"""The matchers that have a name: that of production, and ours."""
 
 
 class StartSettings(Settings):
@@ -298,8 +247,9 @@ class VirtualSettings(Settings):
 class LabelSettings(Settings):
     """How errors are measured: the matcher decides them (definitions, section 5)."""
 
-    matcher: Literal["default", "autoware"] | RegistrationSettings = "autoware"
-    """The matcher: `autoware` (production, the paper's kind), `default` (ours), or its settings."""
+    matcher: Annotated[str | RegistrationSettings, BeforeValidator(matcher_named)] = "autoware"
+    """The matcher: `autoware` (production, the paper's kind), `default` (ours), its settings, or
+    Autoware's own ndt_scan_matcher.param.yaml, or a folder with it and the filters of its scans."""
     starts: StartSettings = StartSettings()
     """Where registrations start."""
     true_pose: TruePose = "log"
@@ -330,8 +280,8 @@ class SimulateSettings(Settings):
     """Turns of the lidar kept at each sample point."""
     seed: int = 0
     """Seed of everything that is simulated."""
-    folder: str | None = None
-    """Where it is kept; not given: `simulation` in the run directory."""
+    folder: LocalFile | None = None
+    """Where it is kept, on a disk; not given: `simulation` in the run directory."""
 
 
 class ReportSettings(Settings):
@@ -362,6 +312,17 @@ class PlaceSettings(Settings):
     """Edge of an NDT cell [m]."""
     memory: Bytes = Field(default="1.5GB", validate_default=True)
     """What one task may use [bytes], also as 512MB or 2GB."""
+
+    def cells_for(self, matcher: RegistrationSettings) -> float:
+        """Edge of an NDT cell: the one that the matcher wants, if it wants one [m].
+
+        Raises:
+            UsageError: another one was given.
+        """
+        if "cell_size" in self.model_fields_set or matcher.resolution is None:
+            matcher.require_cells(self.cell_size)
+            return self.cell_size
+        return matcher.resolution
 
     @property
     def vehicle(self) -> Carrier:

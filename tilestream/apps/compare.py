@@ -15,7 +15,9 @@ import pandas as pd
 
 from tilestream.errors import PartialError, UsageError
 from tilestream.factors.rows import in_route_order
+from tilestream.files import place_of
 from tilestream.grid import MM_PER_M, whole_mm
+from tilestream.matcher import RegistrationSettings
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, paths_of
 from tilestream.pipeline.engine.stage import Task
@@ -26,7 +28,7 @@ from tilestream.pipeline.stages.observe import Observing, observe
 from tilestream.records import Route, RouteZ
 from tilestream.report.comparison import CELL_COLUMNS, ROW_COLUMNS, USUAL, Comparison
 from tilestream.sensor import Carrier
-from tilestream.settings import LabelSettings, RegistrationSettings, VirtualSettings
+from tilestream.settings import LabelSettings, VirtualSettings
 from tilestream.store import TileStore, cells_table
 from tilestream.tables import read_tables
 
@@ -217,7 +219,7 @@ def plan_compare(
             sensor_height,
             route_z,
         )
-        folder = f"{os.fspath(out)}/{choice.name}"
+        folder = f"{place_of(out)}/{choice.name}"
         planned = plan_observe(map_plan, samples, folder, observing, memory, group=choice.name)
         tasks += planned.outputs(observe.name)
     usual_mm = whole_mm(USUAL, "cell_size")

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from tilestream.errors import DamagedError, TilestreamError, UsageError
-from tilestream.files import Files
+from tilestream.files import Files, place_of
 from tilestream.lock import only_writer
 from tilestream.marks import unsealed
 from tilestream.pipeline.jobs.inventory import INVENTORY, Entry, inventory_of
@@ -49,7 +49,7 @@ def verify(place: str | os.PathLike[str]) -> tuple[int, list[Damage]]:
     Raises:
         UsageError: nothing of ours lies there.
     """
-    found = list(_below(os.fspath(place)))
+    found = list(_below(place_of(place)))
     if not found:
         raise UsageError(f"{place} is no tile store and no run directory: nothing to verify there")
     return len(found), [damage for damage in found if damage is not None]

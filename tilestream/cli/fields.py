@@ -20,6 +20,10 @@ LOGS = "How logs are read"
 """Heading of the options that all commands have that read logs."""
 
 
+CONTEXT, KEYWORD = "context", inspect.Parameter.POSITIONAL_OR_KEYWORD
+"""The argument by which a command gets the line that it was called with."""
+
+
 @dataclass(frozen=True)
 class Fields:
     """Which fields of settings a command has as options."""
@@ -44,7 +48,7 @@ def with_settings(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command an option for each field of the settings that it takes.
 
     An argument `Annotated[SomeSettings, fields(…)]` becomes these options; the command gets the
-    settings that they make.
+    settings that those on the line make (`model_fields_set`).
 
     Raises:
         UsageError: when the command runs, values that the settings refuse.
@@ -62,16 +66,29 @@ def with_settings(command: Callable[..., None]) -> Callable[..., None]:
         else:
             parameters.append(parameter.replace(annotation=hint))
 
+    asked = any(parameter.name == CONTEXT for parameter in parameters)
+    if not asked:
+        parameters.append(inspect.Parameter(CONTEXT, KEYWORD, annotation=typer.Context))
+
     @functools.wraps(command)
     def wrapped(**values: Any) -> None:
+        context = values[CONTEXT] if asked else values.pop(CONTEXT)
         for group, (model, chosen) in groups.items():
-            values[group] = model(**{name: values.pop(name) for name in chosen.names})
+            of_line = {name: values.pop(name) for name in chosen.names}
+            own = [name for name in of_line if name in chosen.own or was_given(context, name)]
+            values[group] = model(**{name: of_line[name] for name in own})
         command(**values)
 
     first = [p for p in parameters if p.default is inspect.Parameter.empty]
     rest = [p for p in parameters if p.default is not inspect.Parameter.empty]
     wrapped.__signature__ = inspect.Signature([*first, *rest])  # type: ignore[attr-defined]
     return wrapped
+
+
+def was_given(context: typer.Context, name: str) -> bool:
+    """Whether an option is on the line: else its default is nothing that the user has said."""
+    source = context.get_parameter_source(name)
+    return source is None or source.name != "DEFAULT"
 
 
 def _option(model: type[Settings], name: str, own: dict[str, Any]) -> inspect.Parameter:

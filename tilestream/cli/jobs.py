@@ -1,8 +1,8 @@
 """The commands of whole jobs: the main job, its plan, the simulation, the demo."""
 
+import io
 import json
 from importlib import resources
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import pandas as pd
@@ -15,6 +15,7 @@ from tilestream.cli.printing import err, out, print_json, say, say_notes
 from tilestream.cli.progress import progress
 from tilestream.cli.tables import forecast_rows, forecast_table, plan_table, report_table
 from tilestream.errors import LimitError
+from tilestream.files import Files
 from tilestream.pipeline.jobs import run as main_job
 from tilestream.pipeline.jobs import simulate as simulation
 from tilestream.pipeline.jobs.forecast import forecast
@@ -66,19 +67,19 @@ def run(
         require_within(folder, fail_over)
 
 
-def do_job(settings: RunSettings, cluster: Cluster) -> Path:
+def do_job(settings: RunSettings, cluster: Cluster) -> Files:
     """Run the main job with progress; the run directory."""
     with cluster.client(settings.memory) as client, progress() as watch:
-        return main_job.run(settings, client, watch)
+        return Files.at(main_job.run(settings, client, watch))
 
 
-def report_of(folder: Path) -> dict[str, Any]:
+def report_of(folder: Files) -> dict[str, Any]:
     """The figures of a run's report."""
-    found: dict[str, Any] = json.loads((folder / "report" / "report.json").read_text())
+    found: dict[str, Any] = json.loads(folder.under("report/report.json").read())
     return found
 
 
-def show_report(folder: Path) -> None:
+def show_report(folder: Files) -> None:
     """Print the headline of a report and where it is."""
     report = report_of(folder)
     out.print(report_table(report, cards(report)))
@@ -86,7 +87,7 @@ def show_report(folder: Path) -> None:
     for line in [*hardly_measured(report), *lost_labels(report)]:
         say(line)
     say_notes(report["notes"])
-    say(f"The report is at {(folder / 'report' / 'index.html').absolute()}")
+    say(f"The report is at {folder.under('report/index.html').address}")
 
 
 def hardly_measured(report: dict[str, Any]) -> list[str]:
@@ -116,14 +117,15 @@ def lost_labels(report: dict[str, Any]) -> list[str]:
     return [f"{total:,} of {of:,} measured places are not used:", *reasons]
 
 
-def require_within(folder: Path, limit: float) -> None:
+def require_within(folder: Files, limit: float) -> None:
     """Fail where the estimated error exceeds a limit, or is not known: a gate for a map release.
 
     Raises:
         LimitError: the gate is closed; says why (`gate`).
     """
     needed = ["route_id", "arc_length", "estimate"]
-    places = pd.read_parquet(folder / "report" / "places.parquet", columns=needed)
+    table = io.BytesIO(folder.under("report/places.parquet").read())
+    places = pd.read_parquet(table, columns=needed)
     missing = int(places["estimate"].isna().sum())
     say(f"{missing:,} of {len(places):,} sample points have no estimate", to=err)
     closed = gate(places, limit, report_of(folder)["drives"])

@@ -41,6 +41,8 @@ def ingest(
         planned = ingest_map.plan_ingest(sources, store, settings, allowed, how.log_options, scans)
         out.print(plan_table(planned.scatters))
         say_notes(planned.notes)
+        if planned.left_out:
+            raise PartialError(f"{store}: sources that would be left out:", planned.left_out)
         return
     failed: PartialError | None = None
     with cluster.client(allowed) as client, progress() as watch:

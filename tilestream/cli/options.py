@@ -8,7 +8,7 @@ import typer
 
 from tilestream.cli.printing import say_notes
 from tilestream.errors import PartialError, UsageError
-from tilestream.formats.routes import RoutesRead, read_all_routes, together
+from tilestream.formats.routes import RoutesRead, read_all_routes, read_each
 from tilestream.notes import noticed
 from tilestream.pipeline.jobs.along_routes import off_map
 from tilestream.pipeline.jobs.sources import map_notes
@@ -55,12 +55,12 @@ def routes_of(
         PartialError: when all is done with the good ones, some cannot be used; lists them, with
             what else failed.
     """
-    map_crs = store.settings.crs
-    read = together(
-        read_all_routes(path, project_to=project_to, map_crs=map_crs, log_options=log_options)
-        for path in files
-    )
-    read = read.at_least(spacing)
+    how = {
+        "project_to": project_to,
+        "map_crs": store.settings.crs,
+        "log_options": log_options,
+    }
+    read = read_each(((path, how) for path in files), read_all_routes).at_least(spacing)
     known = () if store.manifest is None else store.manifest.identities
     far = {"routes": off_map(known, store.grid, read.routes)}
     notes = noticed(map_notes(store), read.notes_of(files), far)

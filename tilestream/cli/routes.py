@@ -1,7 +1,6 @@
 """The commands along routes and drives: measure errors, compute factors, compare sensors."""
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Annotated, Any
 
 import pandas as pd
@@ -9,7 +8,7 @@ import typer
 
 from tilestream.apps import compare as comparing
 from tilestream.cli.cluster import HERE, Cluster, on_cluster
-from tilestream.cli.fields import fields, with_settings
+from tilestream.cli.fields import fields, was_given, with_settings
 from tilestream.cli.options import AsJson, DryRun, Routes, StoreUrl, numbers, routes_of
 from tilestream.cli.printing import out, print_json, say, say_notes
 from tilestream.cli.progress import progress
@@ -23,7 +22,9 @@ from tilestream.cli.tables import (
 from tilestream.errors import LimitError, PartialError
 from tilestream.factors.catalogue import Which
 from tilestream.factors.heights import notes_of_routes
-from tilestream.notes import noticed
+from tilestream.files import Files
+from tilestream.matcher import RegistrationSettings
+from tilestream.notes import MATCHER, noticed
 from tilestream.pipeline.jobs import along_routes
 from tilestream.pipeline.jobs import localize as localize_drive
 from tilestream.pipeline.jobs.drive_measured import drive_measured
@@ -43,7 +44,6 @@ from tilestream.settings import (
     LogSettings,
     MapSettings,
     PlaceSettings,
-    RegistrationSettings,
     ReportSettings,
     StartSettings,
     VirtualSettings,
@@ -87,9 +87,10 @@ def localize(
     cluster: Cluster = HERE,
 ) -> None:
     """Measure the localization error along a drive: 317 registrations per sample point."""
-    registration = labels.registration.model_copy(update={"scan_leaf": leaf.scan_leaf})
+    given = {name: getattr(leaf, name) for name in leaf.model_fields_set}
+    registration = labels.registration.model_copy(update=given)
     how: dict[str, Any] = {
-        "cell_size": places.cell_size,
+        "cell_size": places.cells_for(registration),
         "spacing": places.spacing,
         "registration": registration,
         "starts": starts,
@@ -101,7 +102,8 @@ def localize(
     opened, reading = open_store(store), reading_of(drive)
     log = opened_log(reading)
     shared = localize_drive.drive_overlap(reading, how["scans"], places.spacing, opened.sources())
-    notes = noticed(map_notes(opened), {drive.log: [*log.notes, *shared.notes]})
+    of_drive = {drive.log: [*log.notes, *shared.notes], MATCHER: registration.notes}
+    notes = noticed(map_notes(opened), of_drive)
     say_notes(notes)
     if not labels.allow_overlap:
         shared.require_none()
@@ -209,6 +211,7 @@ def factors(
 @on_cluster
 @with_settings
 def compare(
+    context: typer.Context,
     store: StoreUrl,
     route: Routes,
     folder: Annotated[str, typer.Option("--out", help="Folder of the page and the tables.")],
@@ -248,14 +251,17 @@ def compare(
     opened = open_store(store)
     with routes_of(route, places.project_to, places.spacing, opened, log) as (read, notes):
         routes = read.routes
+        registration, height = labels.registration, places.sensor_height
+        say_notes({MATCHER: registration.notes})
+        own = None if was_given(context, "cell_size") else registration.resolution
         choices = comparing.choices_of(
             [sensor_of(name) for name in sensor],
             numbers(ranges, "--range-max") or (None,),
             numbers(blind_rear, "--blind-rear-deg"),
-            numbers(cell_size, "--cell-size"),
+            numbers(cell_size, "--cell-size") if own is None else [own],
         )
-        registration, height = labels.registration, places.sensor_height
-        z = places.route_z
+        registration = registration.model_copy(update={"resolution": None})
+        height, z = places.sensor_height, places.route_z
         if dry_run:
             plan = comparing.plan_compare(
                 opened,
@@ -288,7 +294,8 @@ def compare(
                 partial=which_map.partial,
             )
         first = found.rows[found.rows["choice"] == found.rows["choice"].iloc[0]]
-        found = replace(found, notes=noticed(notes, _heights_told(first, places)))
+        told = noticed(notes, {MATCHER: registration.notes}, _heights_told(first, places))
+        found = replace(found, notes=told)
         content = write_comparison(found, folder, threshold=report.threshold, cap=cap)
         _show_comparison(content, store, folder, as_json)
 
@@ -310,7 +317,7 @@ def _show_comparison(content: dict[str, Any], store: str, folder: str, as_json: 
         print_json(content)
     else:
         out.print(comparison_table(content))
-        say(f"The page is at {(Path(folder) / 'compare.html').absolute()}")
+        say(f"The page is at {Files.at(folder).under('compare.html').address}")
     if not any(choice["estimated"] for choice in content["choices"]):
         reasons = content["choices"][0]["missing"]
         failures = {str(reason): f"{count} sample points" for reason, count in reasons.items()}

@@ -31,10 +31,11 @@ from tilestream.factors.virtual_scan import (
 from tilestream.formats.logs.poses import transform
 from tilestream.grid import MM_PER_M, Box
 from tilestream.kernels.cells import cell_of_points, cell_sums
+from tilestream.matcher import RegistrationSettings
 from tilestream.records import Cells, Column, Float64, Int64
 from tilestream.registration import register
 from tilestream.sensor import VLP16, Carrier, fov_deg_of
-from tilestream.settings import RegistrationSettings, VirtualSettings
+from tilestream.settings import VirtualSettings
 from tilestream.store import TileStore
 
 BLOCK = 25.0

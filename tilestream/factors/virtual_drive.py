@@ -10,9 +10,9 @@ import numpy as np
 import pandas as pd
 
 from tilestream.label import FAILED, NEAR, disc_starts, start_errors
+from tilestream.matcher import RegistrationSettings
 from tilestream.records import Cells, Column, Float64
 from tilestream.registration import register
-from tilestream.settings import RegistrationSettings
 
 STRATA = ((0.0, 0.5, 1.0 / 8.0), (0.5, 0.75, 1.0 / 4.0), (0.75, 1.0, 5.0 / 8.0))
 """Rings of the disc of starts: inner and outer radius as shares of the disc's, and share of the

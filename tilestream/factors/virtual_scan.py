@@ -22,6 +22,7 @@ from tilestream.kernels.virtual_scan import (
     leave_map,
     mark_bricks,
 )
+from tilestream.preprocessing import GOLDEN, mixed
 from tilestream.records import Float64, Int64
 from tilestream.sensor import Carrier, rim_of
 from tilestream.settings import VirtualSettings
@@ -288,16 +289,7 @@ def draws(place_mm: Int64, seed: int, beams: int, per_beam: int) -> Float64:
     """
     state = np.array([seed], np.uint64)
     for coordinate in place_mm.astype(np.int64).view(np.uint64):
-        state = _mixed(state + _GOLDEN) ^ coordinate
+        state = mixed(state + GOLDEN) ^ coordinate
     count = np.arange(1, per_beam * beams + 1, dtype=np.uint64).reshape(per_beam, beams)
-    bits = _mixed(_mixed(state + _GOLDEN) + count * _GOLDEN) >> np.uint64(11)
+    bits = mixed(mixed(state + GOLDEN) + count * GOLDEN) >> np.uint64(11)
     return (bits.astype(np.float64) + 0.5) * 2.0**-53
-
-
-_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
-
-
-def _mixed(state: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return state ^ (state >> np.uint64(31))

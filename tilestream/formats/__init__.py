@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from tilestream.errors import SourceNotFoundError, UsageError
+from tilestream.files import local_path
 from tilestream.formats.base import Block, PointSource, SourceInfo, Span, corner_of
 from tilestream.formats.drive import DRIVES
 from tilestream.formats.points import autoware, e57, las, pcd, ply
-from tilestream.formats.registry import Format, format_of, format_of_directory
+from tilestream.formats.registry import Format, format_of, format_of_directory, format_of_ending
 
 __all__ = [
     "FORMATS",
@@ -23,6 +24,8 @@ __all__ = [
     "Span",
     "describe",
     "expand_sources",
+    "files_of",
+    "matches_of",
     "open_source",
 ]
 
@@ -55,9 +58,9 @@ def open_source(path: str | os.PathLike[str], **options: object) -> PointSource:
         SourceNotFoundError: there is no such file.
         UnknownFormatError: the ending is of no supported format, or the content is of another one.
         CorruptSourceError: the file is empty, cut short or damaged.
-        UsageError: an option that no format takes.
+        UsageError: an option that no format takes, or a file that is not on this machine.
     """
-    name = os.fspath(path)
+    name = local_path(path)
     found = format_of(name, FORMATS)
     known = {option for f in FORMATS for option in f.options}
     if unknown := sorted(options.keys() - known):
@@ -105,30 +108,51 @@ def expand_sources(
     Raises:
         SourceNotFoundError: a file does not exist or a glob matches nothing; names it.
         UnknownFormatError: a directory of no known format.
+        UsageError: a file that is not on this machine.
     """
     if isinstance(patterns, str | os.PathLike):
         patterns = [patterns]
     found: dict[str, str] = {}
     for pattern in patterns:
-        for path in _expand(os.fspath(pattern)):
-            found.setdefault(os.path.realpath(path), path)
+        for path in matches_of(pattern):
+            for file in files_of(path):
+                found.setdefault(os.path.realpath(file), file)
     return sorted(found.values())
 
 
-def _expand(pattern: str) -> list[str]:
-    if Path(pattern).exists():
-        matches = [pattern]
-    elif glob.has_magic(pattern):
-        named = sorted(glob.glob(pattern, recursive=True))  # noqa: PTH207  Path's is relative only
-        matches = [p for p in named if Path(p).is_file() or format_of_directory(p, FORMATS)]
-    else:
-        raise SourceNotFoundError(f"{pattern}: no such file or directory; check the path")
+def matches_of(pattern: str | os.PathLike[str]) -> list[str]:
+    """The files and directories of known formats that a pattern names, sorted; of a glob also what
+    is called as a file is and is none: a link to nothing, a directory.
+
+    Raises:
+        SourceNotFoundError: it names nothing.
+        UsageError: a file that is not on this machine.
+    """
+    name = local_path(pattern)
+    if Path(name).exists():
+        return [name]
+    if not glob.has_magic(name):
+        raise SourceNotFoundError(f"{name}: no such file or directory; check the path")
+    named = sorted(glob.glob(name, recursive=True))  # noqa: PTH207  Path's is relative only
+    matches = [path for path in named if _is_meant(path)]
     if not matches:
-        raise SourceNotFoundError(f"{pattern}: the pattern matches no file; check the path")
-    return [file for path in matches for file in _files_of(path)]
+        raise SourceNotFoundError(f"{name}: the pattern matches no file; check the path")
+    return matches
 
 
-def _files_of(path: str) -> list[str]:
+def _is_meant(path: str) -> bool:
+    """Whether a glob that matches this means it: not the folders that lie between the files."""
+    if not Path(path).is_dir():
+        return True
+    return format_of_directory(path, FORMATS) is not None or bool(format_of_ending(path, FORMATS))
+
+
+def files_of(path: str) -> list[str]:
+    """The files that a match stands for: those of a map directory, else itself.
+
+    Raises:
+        SourceError: a directory of no known format, or a map directory that cannot be read.
+    """
     maps = (autoware.FORMAT, autoware.UNDIVIDED)
     if Path(path).is_dir() and format_of(path, FORMATS) in maps:
         return list(autoware.open_map_directory(path).files)

@@ -83,7 +83,9 @@ def format_of(path: str, formats: Sequence[Format[Opened_co]]) -> Format[Opened_
             )
         return found
     if not Path(path).is_file():
-        raise SourceNotFoundError(f"{path}: no such file; check the path")
+        place = Path(path)
+        link = f", but a link to {place.readlink()}" if place.is_symlink() else ""
+        raise SourceNotFoundError(f"{path}: no such file{link}; check the path")
     with Path(path).open("rb") as file:
         head = file.read(_HEAD)
     content = next((f for f in formats if f.looks_like(head)), None)

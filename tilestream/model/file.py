@@ -11,7 +11,6 @@ import os
 import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -62,10 +61,8 @@ def save_model(model: Model, path: str | os.PathLike[str]) -> None:
 
     Args:
         model: what to write.
-        path: a local path; a file there is replaced.
+        path: a local path or any fsspec URL; a file there is replaced.
     """
-    place = Path(path)
-    place.parent.mkdir(parents=True, exist_ok=True)
     facts = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -104,11 +101,13 @@ def load_model(path: str | os.PathLike[str]) -> Model:
         ModelError: no model of tilestream, a damaged one, one that names other types (they are
             listed), or one of another version of the format or of scikit-learn.
     """
-    place = Path(path)
-    if not place.is_file():
-        raise SourceNotFoundError(f"{place}: no such model file")
+    place = Files.at(path).address
+    try:
+        packed = Files.at(path).read()
+    except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
+        raise SourceNotFoundError(f"{place}: no such model file") from None
     with foreign_errors(ModelError, f"{place}: no model file of tilestream", "train it again"):
-        data, schema = _unpacked(place.read_bytes())
+        data, schema = _unpacked(packed)
         others = sorted(set(_types(schema)) - TYPES)
     if others:
         raise ModelError(
@@ -172,7 +171,7 @@ def _types(node: Any) -> Iterator[str]:
             yield from _types(value)
 
 
-def _refuse_other_versions(place: Path, facts: Mapping[str, Any]) -> None:
+def _refuse_other_versions(place: str, facts: Mapping[str, Any]) -> None:
     if facts.get("format") != FORMAT:
         raise ModelError(f"{place}: no model of tilestream")
     if facts["format_version"] != FORMAT_VERSION:

@@ -3,7 +3,6 @@
 import io
 import json
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -47,22 +46,17 @@ _CATALOGUE = {
 """What each column of the places means."""
 
 
-def write_bytes(path: Path, data: bytes) -> None:
-    """Write a file that is whole or not there."""
-    Files.at(path).write(data)
-
-
-def write_text(path: Path, text: str) -> None:
+def write_text(file: Files, text: str) -> None:
     """Write text as UTF-8."""
-    write_bytes(path, text.encode("utf-8"))
+    file.write(text.encode("utf-8"))
 
 
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
+def write_json(file: Files, content: Mapping[str, Any]) -> None:
     """Write strict JSON: what is not a number is null."""
-    write_text(path, json.dumps(plain(content), indent=1, allow_nan=False) + "\n")
+    write_text(file, json.dumps(plain(content), indent=1, allow_nan=False) + "\n")
 
 
-def write_csv(path: Path, places: pd.DataFrame) -> None:
+def write_csv(file: Files, places: pd.DataFrame) -> None:
     """Write the places; numbers as they are, to the bit, and empty where there is none.
 
     A text that a spreadsheet would take for a formula has a `'` before it.
@@ -70,7 +64,7 @@ def write_csv(path: Path, places: pd.DataFrame) -> None:
     texts = places.select_dtypes(exclude=["number", "bool"])
     safe = {str(name): column.map(_no_formula) for name, column in texts.items()}
     places = places.assign(**safe)
-    write_text(path, places.to_csv(index=False, lineterminator="\n"))
+    write_text(file, places.to_csv(index=False, lineterminator="\n"))
 
 
 def _no_formula(cell: Any) -> Any:
@@ -80,7 +74,7 @@ def _no_formula(cell: Any) -> Any:
     return f"'{cell}" if cell.startswith(FORMULA) else cell
 
 
-def write_geoparquet(path: Path, found: Findings) -> None:
+def write_geoparquet(file: Files, found: Findings) -> None:
     """Write the places as GeoParquet 1.1: a WKB point each, null where a coordinate is missing.
 
     Every column of ours carries its unit, meaning and source.
@@ -109,7 +103,7 @@ def write_geoparquet(path: Path, found: Findings) -> None:
     )
     buffer = io.BytesIO()
     pq.write_table(table.cast(schema), buffer, compression="zstd")
-    write_bytes(path, buffer.getvalue())
+    file.write(buffer.getvalue())
 
 
 def _wkb(at: Float64, placed: np.ndarray[Any, np.dtype[np.bool_]]) -> list[bytes | None]:
@@ -127,7 +121,7 @@ def _documented(field: pa.Field) -> pa.Field:
     )
 
 
-def write_geojson(path: Path, found: Findings, threshold: float) -> None:
+def write_geojson(file: Files, found: Findings, threshold: float) -> None:
     """Write the segments over a threshold: lines, and points where one sample point stands alone.
 
     Positions are longitude and latitude, as GeoJSON wants; of a map without a CRS they are its
@@ -168,7 +162,7 @@ def write_geojson(path: Path, found: Findings, threshold: float) -> None:
         "coordinates": degrees if crs is not None else "map frame [m]; the map names no CRS",
         "features": features,
     }
-    write_json(path, collection)
+    write_json(file, collection)
 
 
 def _crs(name: str | None) -> CRS | None:
@@ -178,7 +172,7 @@ def _crs(name: str | None) -> CRS | None:
         raise CrsError(f"{name!r} is no CRS that pyproj knows ({error})") from error
 
 
-def write_cloud(path: Path, places: pd.DataFrame) -> int:
+def write_cloud(file: Files, places: pd.DataFrame) -> int:
     """Write the sample points as PCD, coloured as on the map (`rgb` as PCL packs it), with their
     `estimate` [m]; grey and NaN where there is none.
 
@@ -194,5 +188,5 @@ def write_cloud(path: Path, places: pd.DataFrame) -> int:
         "rgb": packed.view(np.float32),
         "estimate": estimate[placed].astype(np.float32),
     }
-    write_pcd(path, at[placed], fields=fields)
+    write_pcd(file.address, at[placed], fields=fields)
     return int((~placed).sum())

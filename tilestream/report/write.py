@@ -1,18 +1,18 @@
 """Findings or a comparison in, a folder out."""
 
+import os
 import re
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tilestream.errors import TilestreamError
+from tilestream.files import Files
 from tilestream.report import pictures
 from tilestream.report.comparison import Comparison
 from tilestream.report.data import Findings, estimates
 from tilestream.report.exports import (
-    write_bytes,
     write_cloud,
     write_csv,
     write_geojson,
@@ -34,7 +34,7 @@ OURS = re.compile(r"(map|distribution|paths|importances|coverage|worst_\d+)\.png
 
 
 def write_report(
-    findings: Findings, folder: str | Path, *, threshold: float = THRESHOLD
+    findings: Findings, folder: str | os.PathLike[str], *, threshold: float = THRESHOLD
 ) -> dict[str, Any]:
     """Write the page and the files beside it: each of them whole, or not there.
 
@@ -44,7 +44,7 @@ def write_report(
 
     Args:
         findings: what is reported.
-        folder: where to; made where it does not exist.
+        folder: where to, a local path or any fsspec URL; made where it does not exist.
         threshold: estimates above this are too large [m].
 
     Returns:
@@ -55,28 +55,28 @@ def write_report(
         CrsError: a CRS that pyproj does not know.
     """
     check_threshold(threshold)
-    place = Path(folder)
-    (place / "figures").mkdir(parents=True, exist_ok=True)
+    place = Files.at(folder)
+    place.under("figures").make()
     content = summary(findings, threshold)
-    write_geoparquet(place / "places.parquet", findings)
-    write_geojson(place / "over_threshold.geojson", findings, threshold)
-    write_csv(place / "places.csv", findings.places)
-    content["not_in_cloud"] = write_cloud(place / "map.pcd", findings.places)
+    write_geoparquet(place.under("places.parquet"), findings)
+    write_geojson(place.under("over_threshold.geojson"), findings, threshold)
+    write_csv(place.under("places.csv"), findings.places)
+    content["not_in_cloud"] = write_cloud(place.under("map.pcd"), findings.places)
     worst = {n: _picture(findings, at) for n, at in enumerate(content["worst"], start=1)}
-    content["figures"] = _write_figures(place / "figures", findings, worst)
-    write_text(place / "index.html", report_page(findings, content, worst))
-    write_json(place / "report.json", content)
+    content["figures"] = _write_figures(place.under("figures"), findings, worst)
+    write_text(place.under("index.html"), report_page(findings, content, worst))
+    write_json(place.under("report.json"), content)
     return dict(plain(content))
 
 
 def write_comparison(
-    found: Comparison, folder: str | Path, *, threshold: float, cap: float
+    found: Comparison, folder: str | os.PathLike[str], *, threshold: float, cap: float
 ) -> dict[str, Any]:
     """Write `compare.html` (needs no network), `compare.json` and `compare.csv`, each whole.
 
     Args:
         found: what is compared.
-        folder: where to; made where it does not exist.
+        folder: where to, a local path or any fsspec URL; made where it does not exist.
         threshold: estimates above this are too large [m].
         cap: within which the 95 % quantile of a tile's estimates must stay [m].
 
@@ -87,11 +87,11 @@ def write_comparison(
         UsageError: a threshold or cap that is no positive length.
     """
     content = found.content(threshold, cap)
-    place = Path(folder)
-    place.mkdir(parents=True, exist_ok=True)
-    write_csv(place / "compare.csv", found.rows)
-    write_text(place / "compare.html", comparison_page(found, content))
-    write_json(place / "compare.json", content)
+    place = Files.at(folder)
+    place.make()
+    write_csv(place.under("compare.csv"), found.rows)
+    write_text(place.under("compare.html"), comparison_page(found, content))
+    write_json(place.under("compare.json"), content)
     return content
 
 
@@ -111,7 +111,9 @@ def _picture(findings: Findings, worst: Mapping[str, Any]) -> bytes | str:
     return pictures.png(pictures.surroundings(points, np.array([x, y, z]), worst["heading"]))
 
 
-def _write_figures(folder: Path, findings: Findings, worst: Mapping[int, bytes | str]) -> list[str]:
+def _write_figures(
+    folder: Files, findings: Findings, worst: Mapping[int, bytes | str]
+) -> list[str]:
     """Write what there is to draw; the names of the files."""
     drawn = {"map.png": pictures.map_figure(findings)}
     if len(findings.labels) or np.isfinite(estimates(findings.places)).any():
@@ -125,8 +127,8 @@ def _write_figures(folder: Path, findings: Findings, worst: Mapping[int, bytes |
     files = {name: pictures.png(figure) for name, figure in drawn.items()}
     files |= {f"worst_{n:02d}.png": data for n, data in worst.items() if isinstance(data, bytes)}
     for name, data in files.items():
-        write_bytes(folder / name, data)
-    for old in folder.iterdir():
-        if OURS.fullmatch(old.name) and old.name not in files:
-            old.unlink()
+        folder.under(name).write(data)
+    for old in folder.names():
+        if OURS.fullmatch(old) and old not in files:
+            folder.under(old).remove()
     return sorted(files)

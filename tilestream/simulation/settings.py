@@ -12,6 +12,7 @@ from pydantic import BeforeValidator, Field
 from tilestream.bounded_yaml import read_yaml
 from tilestream.config import Settings
 from tilestream.errors import SourceNotFoundError, UsageError
+from tilestream.files import local_path
 from tilestream.sensor import SENSORS, Sensor, Vehicle, named
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -157,9 +158,10 @@ def load_preset(name: str) -> SimulationSettings:
         UsageError: an unknown key or a value that cannot be; names the file.
     """
     shipped = resources.files("tilestream") / "simulation" / "presets" / f"{name}.yaml"
-    if not shipped.is_file() and not Path(name).is_file():
+    own = Path(local_path(name))
+    if not shipped.is_file() and not own.is_file():
         raise SourceNotFoundError(f"{name}: no preset and no file; presets are paper and physical")
-    with resources.as_file(shipped) if shipped.is_file() else nullcontext(Path(name)) as path:
+    with resources.as_file(shipped) if shipped.is_file() else nullcontext(own) as path:
         values = read_yaml(path, UsageError) or {}
     try:
         return SimulationSettings(**values)

@@ -14,10 +14,10 @@ manifest does not name is none; every reader looks at both. All that is read has
 """
 
 import html
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -29,7 +29,7 @@ from tilestream.errors import (
     StoreError,
     TileNotReadyError,
 )
-from tilestream.files import Files
+from tilestream.files import Files, place_of
 from tilestream.grid import MM_PER_M, Box, TileGrid, TileKey, whole_mm
 from tilestream.lock import LOCK, writer_of
 from tilestream.marks import Mark
@@ -46,7 +46,7 @@ from tilestream.store.arrays import (
 from tilestream.store.condition import Condition as Condition
 from tilestream.store.manifest import Manifest as Manifest
 from tilestream.store.manifest import read_manifest, remove_other_manifests
-from tilestream.store.record import Record, State, read_record, write_record
+from tilestream.store.record import Record, State, read_record, source_of, way_of, write_record
 from tilestream.store.record import StoreSettings as StoreSettings
 from tilestream.store.table import CELLS_VERSION as CELLS_VERSION
 from tilestream.store.table import TileTable as TileTable
@@ -195,8 +195,8 @@ class TileStore:
     AWS_ENDPOINT_URL, …), so that workers on other machines find them too.
     """
 
-    def __init__(self, url: str, settings: StoreSettings) -> None:
-        self.url = url
+    def __init__(self, url: str | os.PathLike[str], settings: StoreSettings) -> None:
+        self.url = place_of(url)
         self.settings = settings
         self.grid = TileGrid.of(settings.tile_size, settings.halo)
 
@@ -208,13 +208,13 @@ class TileStore:
     @property
     def address(self) -> str:
         """The store's URL; of a local store its absolute path, for readers started elsewhere."""
-        return self.url if "://" in self.url else str(Path(self.url).absolute())
+        return self.url
 
     def __getstate__(self) -> dict[str, Any]:
         return {"url": self.url, "settings": self.settings, "grid": self.grid}
 
     @classmethod
-    def create(cls, url: str, settings: StoreSettings) -> Self:
+    def create(cls, url: str | os.PathLike[str], settings: StoreSettings) -> Self:
         """A new, empty store, whose tiles are not known yet.
 
         Raises:
@@ -240,7 +240,7 @@ class TileStore:
 
         Empty until an ingest has ended.
         """
-        return [dict(source) for source in read_record(self.url).sources]
+        return [source_of(self.files, source) for source in read_record(self.url).sources]
 
     def made_by(self) -> dict[str, int]:
         """The stages that made the map, with their versions; empty until an ingest has ended."""
@@ -270,7 +270,8 @@ class TileStore:
 
         A map whose tiles were never known is not whole by that.
         """
-        record = replace(read_record(self.url), sources=sources, made_by=made_by)
+        known = [{**source, "way": way_of(self.files, source["path"])} for source in sources]
+        record = replace(read_record(self.url), sources=known, made_by=made_by)
         self._write(record if record.manifest is None else replace(record, state="whole"))
 
     def forget(self) -> None:
@@ -407,7 +408,7 @@ class TileStore:
         return f"<p>{html.escape(repr(self))}</p><table>{head}{body}</table>{more}"
 
 
-def open_store(url: str) -> TileStore:
+def open_store(url: str | os.PathLike[str]) -> TileStore:
     """Open a tile store that `ingest` made, or is making (`TileStore.condition`).
 
     Args:
@@ -420,4 +421,5 @@ def open_store(url: str) -> TileStore:
         StoreError: something else lies there.
         UsageError: a file lies there, or where a folder above it would be.
     """
-    return TileStore(str(url), read_record(str(url)).settings)
+    place = place_of(url)
+    return TileStore(place, read_record(place).settings)

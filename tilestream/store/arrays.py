@@ -8,12 +8,12 @@ is, and comes last: without it there is no table.
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import zarr
 from numpy.typing import NDArray
-from zarr.codecs import BloscCodec, Crc32cCodec
+from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec
 from zarr.core.buffer import cpu
 from zarr.storage import MemoryStore
 
@@ -23,6 +23,8 @@ from tilestream.marks import AGAIN, MISSING, SEAL, Mark, sealed, unsealed
 
 _OURS = "tilestream"
 """The attribute of a Zarr node that is ours."""
+FORMAT: Literal[3] = 3
+"""Zarr's format; named wherever Zarr is asked, whose own settings name another one maybe."""
 NODE, CHUNK = "zarr.json", "c/0"
 """The two objects of a table."""
 
@@ -30,7 +32,7 @@ NODE, CHUNK = "zarr.json", "c/0"
 def write_group(files: Files, attributes: Mapping[str, Any]) -> None:
     """Write a Zarr group of ours: whole, or as it was."""
     kept: dict[str, Any] = {}
-    zarr.open_group(MemoryStore(kept), mode="w")
+    zarr.open_group(MemoryStore(kept), mode="w", zarr_format=FORMAT)
     _write_node(files, kept, attributes)
 
 
@@ -107,7 +109,7 @@ def read_columns(files: Files, table: str) -> dict[str, NDArray[Any]]:
         name: cpu.Buffer.from_bytes(b) for name, b in ((NODE, node), (CHUNK, chunk)) if b
     }
     try:
-        packed = np.asarray(zarr.open_array(MemoryStore(kept), mode="r")[...])
+        packed = np.asarray(zarr.open_array(MemoryStore(kept), mode="r", zarr_format=FORMAT)[...])
         return _unpacked(packed, columns)
     except (ValueError, RuntimeError, TypeError) as error:
         raise DamagedError(f"{where}/{CHUNK} is damaged ({error}): {AGAIN}") from error
@@ -124,7 +126,10 @@ def write_columns(
         shape=packed.shape,
         chunks=(max(1, packed.size),),
         dtype=packed.dtype,
+        filters=None,
+        serializer=BytesCodec(endian="little"),
         compressors=[_codec(columns), Crc32cCodec()],
+        zarr_format=FORMAT,
         config={"write_empty_chunks": True},
     )
     array[...] = packed

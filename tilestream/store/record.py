@@ -1,7 +1,9 @@
 """What a store says of itself, at its root: settings, state, manifest, what it was made from."""
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 from tilestream.errors import (
@@ -47,6 +49,30 @@ class Record:
     """What the map was made from."""
     made_by: Mapping[str, int] | None = None
     """The stages that made it, with their versions; None: no ingest has ended."""
+
+
+def way_of(files: Files, path: str) -> str | None:
+    """A source seen from the store that lies there: a way that moves with both; None: they are not
+    on one disk.
+    """
+    try:
+        store = os.path.realpath(files.root)
+        return os.path.relpath(os.path.realpath(path), store) if files.local else None
+    except ValueError:  # two disks of Windows
+        return None
+
+
+def source_of(files: Files, known: Mapping[str, Any]) -> dict[str, Any]:
+    """A source as the record of the store that lies there has it, `path` being where it is now:
+    where it is seen from the store, as long as it is there, else where it was.
+    """
+    source = dict(known)
+    way = source.pop("way", None)  # which a record of before does not have
+    if way is not None and files.local:
+        now = os.path.normpath(os.path.join(os.path.realpath(files.root), way))  # noqa: PTH118
+        if os.path.realpath(source["path"]) != now and Path(now).exists():
+            source["path"] = now
+    return source
 
 
 def write_record(files: Files, record: Record) -> None:

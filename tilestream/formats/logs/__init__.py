@@ -4,6 +4,7 @@ from functools import lru_cache
 from glob import glob, has_magic
 from pathlib import Path
 
+from tilestream.files import local_path
 from tilestream.formats.logs import mcap, ros_bags, rosbag2
 from tilestream.formats.logs.base import Recording
 from tilestream.formats.logs.mcap_write import write_log
@@ -54,12 +55,13 @@ def open_log(path: str | Path, options: LogOptions | None = None) -> ScanLog:
 
     Raises:
         SourceNotFoundError: no such file.
+        UsageError: a file that is not on this machine.
         UnknownFormatError: a file or directory of no known format; says what is known.
         CorruptSourceError: the log is damaged or contradicts itself; names file and place.
         SourceError: no scans, or several topics that are equally good; names what is there.
         PoseError: no poses, none at the time of any scan, or several topics that are equally good.
     """
-    name, options = str(path), options or LogOptions()
+    name, options = local_path(path), options or LogOptions()
     topics = [part.strip() or None for part in (options.points_topic or "").split(",")]
     found, state = format_of(name, LOG_FORMATS), state_of(name)
     logs = [

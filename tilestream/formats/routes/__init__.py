@@ -2,13 +2,14 @@
 
 from tilestream.formats.routes.arc_length import resample, route_of
 from tilestream.formats.routes.reading import READERS, read_all_routes, read_route, read_routes
-from tilestream.formats.routes.routes_read import RoutesRead, together
+from tilestream.formats.routes.routes_read import RoutesRead, read_each, together
 from tilestream.formats.routes.write import write_geojson_route, write_tum
 
 __all__ = [
     "READERS",
     "RoutesRead",
     "read_all_routes",
+    "read_each",
     "read_route",
     "read_routes",
     "resample",

@@ -14,6 +14,7 @@ from tilestream.errors import (
     UnknownFormatError,
     foreign_errors,
 )
+from tilestream.files import local_path
 from tilestream.formats.logs import LOG_FORMATS, is_log, open_log
 from tilestream.formats.routes.arc_length import route_of
 from tilestream.formats.routes.base import Lost, Path3
@@ -86,11 +87,12 @@ def read_all_routes(
 
     Raises:
         SourceNotFoundError: no such file.
+        UsageError: a file that is not on this machine.
         UnknownFormatError: an ending of no supported format.
         CrsError: degrees without a CRS to project to, or that no place on earth has; a CRS that
             cannot be used, or that is not the map's and cannot be brought there.
     """
-    name = str(path)
+    name = local_path(path)
     options = log_options or LogOptions()
     try:
         with foreign_errors(CorruptSourceError, f"{name}: cannot be read as routes"):
@@ -220,6 +222,8 @@ def _drawn(path: str, options: LogOptions) -> Sequence[Path3 | Lost]:
                 notes=log.notes,
             )
         ]
+    if Path(path).is_dir():
+        raise UnknownFormatError(f"{path}: a directory; give the files of routes in it")
     if not Path(path).is_file():
         raise SourceNotFoundError(f"{path}: no such file; check the path")
     if ending not in READERS:

@@ -1,9 +1,13 @@
 """What was read of files of routes: the good, each with a name of its own, and the bad."""
 
-from collections.abc import Iterable, Sequence
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
-from tilestream.errors import TilestreamError
+from tilestream.errors import SourceError, SourceNotFoundError, TilestreamError
+from tilestream.files import local_path
 from tilestream.formats.routes.arc_length import require_length
 from tilestream.formats.routes.base import Lost
 from tilestream.records import Route
@@ -70,6 +74,41 @@ def together(parts: Iterable[RoutesRead]) -> RoutesRead:
     told = tuple(note for part in parts for note in part.notes)
     lost = tuple(lost for part in parts for lost in part.lost)
     return _some(RoutesRead(routes, lost, (*told, *notes)))
+
+
+def read_each(
+    files: Iterable[tuple[str, Mapping[str, Any]]], read: Callable[..., RoutesRead]
+) -> RoutesRead:
+    """What is read of several files, each once by whatever names it has; one that cannot be read is
+    lost, and the others are read.
+
+    Args:
+        files: each with the keywords of `read`.
+        read: reads one.
+
+    Raises:
+        SourceNotFoundError: there is no such file.
+        TilestreamError: as `together`.
+    """
+    parts: list[RoutesRead] = []
+    names: dict[str, str] = {}
+    for path, options in files:
+        real = os.path.realpath(local_path(path))
+        if real in names:
+            told = f"{path}: the file is named before, as {names[real]}, and is read once"
+            parts.append(RoutesRead(notes=(told,)))
+            continue
+        names[real] = path
+        try:
+            parts.append(read(path, **options))
+        except SourceNotFoundError:
+            raise
+        except SourceError as error:
+            parts.append(RoutesRead(lost=(Lost(Path(path).stem, error),)))
+        except OSError as error:
+            lost = SourceError(f"{path}: cannot be read ({error})")
+            parts.append(RoutesRead(lost=(Lost(Path(path).stem, lost),)))
+    return together(parts)
 
 
 def named(routes: Sequence[Route]) -> tuple[tuple[Route, ...], tuple[str, ...]]:

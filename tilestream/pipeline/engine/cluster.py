@@ -5,6 +5,7 @@ import os
 import signal
 import socket
 import ssl
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from distributed.utils import silence_logging_cmgr
 
 from tilestream.errors import TaskError, UsageError
 from tilestream.pipeline.engine.plan import megabytes
+from tilestream.pipeline.engine.seen import require_blocking
 
 logger = logging.getLogger(__name__)
 
@@ -93,8 +95,9 @@ def dask_client(
             know; for a scheduler elsewhere, Dask's configuration says (`distributed.comm.tls`).
 
     Raises:
-        TaskError: nobody answers at the scheduler's address.
-        UsageError: the scheduler's address is none, or certificates are missing or do not fit.
+        TaskError: nobody answers at the scheduler's address, or no worker can be started.
+        UsageError: the scheduler's address is none, certificates are missing or do not fit, or
+            temporary files cannot be written.
     """
     security = None if tls is None else tls.security()
     count = CPU_COUNT if workers is None else workers
@@ -139,9 +142,13 @@ def _local_cluster(host: str, **how: Any) -> Iterator[Any]:
     Dask's default, `*`, lets any site in the browser of someone who can reach it listen. Other
     names, of a proxy or a tunnel, can be given in Dask's configuration.
     """
+    _require_scratch()
     given = [origin for origin in dask.config.get(ORIGINS) if origin != "*"]
     with dask.config.set({ORIGINS: given}):
-        cluster: Any = distributed.LocalCluster(host=host, **how)
+        try:
+            cluster: Any = distributed.LocalCluster(host=host, **how)
+        except RuntimeError as error:
+            raise TaskError(f"no workers can be started here: {error}") from error
     with cluster:
         names = {"localhost", LOOPBACK}
         if host != LOOPBACK:
@@ -152,6 +159,25 @@ def _local_cluster(host: str, **how: Any) -> Iterator[Any]:
             if hasattr(page, "websocket_origins"):  # it is Bokeh's, which is heavy to import
                 page.websocket_origins.update(f"{name}:{port}" for name in names)
         yield cluster
+
+
+def _require_scratch() -> None:
+    """Refuse to start workers that could not keep temporary files.
+
+    Raises:
+        UsageError: there is no folder for them; says which one it would be.
+    """
+    folder = dask.config.get("temporary-directory", None)
+    for where in dict.fromkeys((folder, None)):
+        try:
+            with tempfile.TemporaryFile(dir=where):
+                pass
+        except OSError as error:
+            named = "Dask's temporary-directory" if where else "TMPDIR"
+            raise UsageError(
+                f"no temporary file can be written ({error}): set {named} to a folder that can be "
+                "written, or give --workers 1"
+            ) from None
 
 
 class _Client(distributed.Client):
@@ -195,12 +221,16 @@ def report_kept(client: Any | None, path: str | os.PathLike[str]) -> Iterator[No
 
     Args:
         client: a Dask client; None: there is nothing to report.
-        path: the file, replaced; where Dask cannot make it any more (the scheduler is lost), a
-            warning says so and nothing else is disturbed.
+        path: the file, or its URL, replaced; where Dask cannot make it any more (the scheduler is
+            lost), a warning says so and nothing else is disturbed.
+
+    Raises:
+        UsageError: the client is asynchronous.
     """
     if client is None:
         yield
         return
+    require_blocking(client)
     report = distributed.performance_report(filename=os.fspath(path), mode="inline")
     with client.as_current():
         report.__enter__()

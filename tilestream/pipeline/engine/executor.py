@@ -1,7 +1,7 @@
 """How tasks run: one by one in this process, or on Dask, with the same outcomes."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from typing import Any
 
@@ -10,6 +10,7 @@ from tilestream.pipeline.engine.dask_executor import DaskNames, run_on_dask
 from tilestream.pipeline.engine.events import dashboard_client
 from tilestream.pipeline.engine.frontier import RETRIES, Frontier
 from tilestream.pipeline.engine.plan import Plan
+from tilestream.pipeline.engine.seen import require_blocking, require_seen
 from tilestream.pipeline.engine.stage import Task
 
 PATIENCE = 600.0
@@ -28,6 +29,7 @@ def execute(
     watch: Watch | None,
     *,
     grow: Grow | None = None,
+    shared: Sequence[str] = (),
     retries: int = RETRIES,
     patience: float = PATIENCE,
 ) -> list[Outcome]:
@@ -42,6 +44,7 @@ def execute(
         client: a Dask client; None: one by one in this process.
         watch: is told of each outcome.
         grow: adds tasks to the plan while it runs.
+        shared: folders and stores that all workers must see.
         retries: how often a task is tried again.
         patience: how long to wait for a worker while the scheduler has none [s].
 
@@ -49,9 +52,13 @@ def execute(
         The outcomes in the order of the tasks, whatever the order in which they ended.
 
     Raises:
+        UsageError: an asynchronous client, or a worker that does not see what is shared.
         TaskError: the scheduler was lost, or has had no worker for too long. What is done is
             marked: the same command continues.
     """
+    if client is not None:
+        require_blocking(client)
+        require_seen(client, shared)
     frontier, names = Frontier(retries), DaskNames()
     work: dict[str, int] = {}
     total: Counter[str] = Counter()

@@ -1,7 +1,7 @@
 """What will run: tasks in an order in which they could run one by one, within a promised memory."""
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from typing import Self
 
 from tilestream.errors import PlanError
@@ -19,6 +19,8 @@ class Plan:
     tasks: tuple[Task, ...]
     memory: int
     """What a task may use [bytes]."""
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    """What was to be worked on and cannot be read, and why."""
 
     @classmethod
     def of(cls, tasks: Iterable[Task], memory: int) -> Self:

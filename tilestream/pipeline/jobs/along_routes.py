@@ -12,7 +12,9 @@ from tilestream.crs import require_same
 from tilestream.errors import PartialError, TileNotReadyError
 from tilestream.factors.catalogue import Which
 from tilestream.factors.rows import Samples, in_route_order, samples_by_tile
+from tilestream.files import place_of
 from tilestream.grid import MM_PER_M, TileGrid, TileKey, whole_mm
+from tilestream.matcher import RegistrationSettings
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, paths_of
 from tilestream.pipeline.engine.stage import Stage
@@ -22,7 +24,7 @@ from tilestream.pipeline.stages.map_plan import MapPlan, apart
 from tilestream.pipeline.stages.observe import Observing, observe, observe_task
 from tilestream.records import Route, RouteZ
 from tilestream.sensor import VLP16, Carrier, Sensor
-from tilestream.settings import LabelSettings, RegistrationSettings, VirtualSettings
+from tilestream.settings import LabelSettings, VirtualSettings
 from tilestream.store import TileStore
 from tilestream.tables import read_tables
 
@@ -174,7 +176,7 @@ def plan_factors(
     """
     map_plan.store.grid.require_cell_size(whole_mm(looking.cell_size, "cell_size"))
     require_near(map_plan, samples)
-    folder = os.fspath(out)
+    folder = place_of(out)
     tasks = [
         factors_task(map_plan, key, some, looking, folder, group, applies)
         for key, some in samples.items()
@@ -263,9 +265,10 @@ def plan_observe(
         group: of which drive, or as whose sensor, where one plan has several.
         applies: `observe`, or `observe_drive`.
     """
+    observing.registration.require_cells(observing.cell_size)
     map_plan.store.grid.require_cell_size(whole_mm(observing.cell_size, "cell_size"))
     require_near(map_plan, samples)
-    folder = os.fspath(out)
+    folder = place_of(out)
     tasks = [
         observe_task(map_plan, key, some, observing, folder, group, applies)
         for key, some in samples.items()

@@ -8,7 +8,7 @@ import numpy as np
 from tilestream.errors import StoreNotFoundError
 from tilestream.formats import describe
 from tilestream.grid import MM_PER_M, Box, TileKey
-from tilestream.notes import Notes, noticed
+from tilestream.notes import MATCHER, Notes, noticed
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.stage import Task
 from tilestream.pipeline.jobs.along_routes import off_map
@@ -68,7 +68,9 @@ def forecast(settings: RunSettings) -> Forecast:
     estimate = plan_estimate(settings, map_plan.store.grid, measure, done)
     tasks = (*reading, *measure.tasks, *estimate.tasks)
     far = {"routes": off_map(map_plan.points, map_plan.store.grid, inputs.routes)}
-    return Forecast(tasks, noticed(notes, inputs.notes, far))
+    lost = [f"{name} is left out: {reason}" for name, reason in measure.left_out.items()]
+    own = {PLAN: lost, MATCHER: settings.label.registration.notes}
+    return Forecast(tasks, noticed(notes, inputs.notes, far, own))
 
 
 def _simulation_first(settings: RunSettings, wanted: SimulateSettings) -> Forecast:
@@ -121,7 +123,8 @@ def _expected_map(
             low, high = (np.round(np.array(corner) * MM_PER_M).astype(int) for corner in bounds)
             box = Box(int(low[0]), int(low[1]), int(high[0]) + 1, int(high[1]) + 1)
             have |= dict.fromkeys(store.grid.keys_over(box), TilePoints("expected", "", 0))
-    notes = [f"at most {len(have)} tiles, by the bounds of the sources; reading tells which"]
+    notes = [f"{path} is left out: {reason}" for path, reason in planned.left_out.items()]
+    notes += [f"at most {len(have)} tiles, by the bounds of the sources; reading tells which"]
     if unknown:
         notes.append(f"only reading tells where the points of {', '.join(unknown[:3])} are")
     sources = [source.record for source in planned.found]

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, fields, replace
+from pathlib import Path
 from typing import Any
 
 from tilestream.crs import same
@@ -97,7 +98,13 @@ def ingest(
     )
     with only_writer(url):
         reading = read_sources(sources, url, settings, memory, log_options, scans)
-        outcomes = execute(reading.first(), client, watch, grow=lambda o: reading.grown(o) or ())
+        outcomes = execute(
+            reading.first(),
+            client,
+            watch,
+            grow=lambda outcome: reading.grown(outcome) or (),
+            shared=[reading.store.url],
+        )
         failures = reading.close(outcomes)
     if failures:
         raise PartialError(
@@ -133,6 +140,11 @@ class Reading:
         spans = {task.key: task.reads["blocks"] for task in self.scatters.tasks}
         self._open = {key: span.path for key, span in spans.items() if isinstance(span, SourceSpan)}
         self._read: dict[str, list[Outcome]] = {source.path: [] for source in found}
+
+    @property
+    def left_out(self) -> dict[str, str]:
+        """The sources that could not be opened, and why."""
+        return {source.path: source.reason for source in self.found if source.reason}
 
     @property
     def notes(self) -> dict[str, list[str]]:
@@ -240,7 +252,11 @@ def read_sources(
     """What `ingest` begins with; arguments and errors as there."""
     found = within(examine_all(sources, settings, log_options, scans), memory)
     store = _create_or_resume(str(url), with_crs(settings, found), found)
-    return Reading(store, found, memory, _is_current(store, found))
+    current = _is_current(store, found)
+    recorded = _recorded(store, found)
+    if current and recorded != store.sources():
+        store.end(recorded, MADE_BY)  # the sources have moved, or have other names now
+    return Reading(store, found, memory, current)
 
 
 def store_settings(settings: IngestSettings) -> StoreSettings:
@@ -258,13 +274,13 @@ def plan_ingest(
 ) -> Reading:
     """What `ingest` would read first, without running or writing anything.
 
-    The tasks that write tiles are planned from what the reading finds. Arguments and errors as for
-    `ingest`; a source that cannot be opened raises its own error here.
+    The tasks that write tiles are planned from what the reading finds; sources that cannot be
+    opened are left out. Arguments and errors as for `ingest`; where no source can be opened, the
+    error is the first one's.
     """
     found = examine_all(sources, settings, log_options, scans)
-    for source in found:
-        if source.reason:
-            raise SourceError(source.reason)
+    if all(source.reason for source in found):
+        raise SourceError(found[0].reason)
     store = TileStore(str(url), store_settings(with_crs(settings, found)))
     return Reading(store, found, memory, current=False)
 
@@ -287,13 +303,32 @@ def _create_or_resume(url: str, settings: IngestSettings, found: Sequence[Source
                 f"{url} has {name} {there!r}, asked for is {value!r}: "
                 "use the same setting, or another path for the new store"
             )
-    forgotten = sorted({s["path"] for s in store.sources()} - {s.path for s in found})
+    given = {source.path for source in found}
+    forgotten = sorted({s["path"] for s in _recorded(store, found)} - given)
     if forgotten:
         raise UsageError(
             f"{url} was also made from {', '.join(forgotten)}: give all sources of the map, "
             "or another path for the new store"
         )
     return store
+
+
+def _recorded(store: TileStore, found: Sequence[Source]) -> list[dict[str, Any]]:
+    """The sources that a store knows, each under the path that it was found by.
+
+    It is known by the file that the path leads to; where nothing is there any more, by name and
+    state: it has moved.
+    """
+    given = {os.path.realpath(source.path): source.path for source in found}
+    moved = {(Path(source.path).name, source.state): source.path for source in found}
+    known = []
+    for source in store.sources():
+        path = source["path"]
+        now = given.get(os.path.realpath(path))
+        if now is None and not Path(path).exists():
+            now = moved.get((Path(path).name, source["state"]))
+        known.append({**source, "path": now or path})
+    return known
 
 
 def _fits(asked: str | None, there: str | None) -> bool:
@@ -303,7 +338,7 @@ def _fits(asked: str | None, there: str | None) -> bool:
 
 def _is_current(store: TileStore, found: Sequence[Source]) -> bool:
     """Whether the store is whole, and made from exactly these sources by these stages."""
-    recorded = {(s["path"], s["state"]) for s in store.sources() if not s["reason"]}
+    recorded = {(s["path"], s["state"]) for s in _recorded(store, found) if not s["reason"]}
     if recorded != {(s.path, s.state) for s in found} or store.made_by() != MADE_BY:
         return False
     condition = store.condition()

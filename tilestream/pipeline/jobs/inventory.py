@@ -11,11 +11,11 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from tilestream.errors import DamagedError, IncompleteError, UsageError
-from tilestream.files import Files
+from tilestream.files import Files, place_of
 from tilestream.lock import only_writer
 from tilestream.marks import sealed, unsealed
 from tilestream.pipeline.engine.executor import Watch, execute
-from tilestream.pipeline.engine.outputs import Parquet, way_to
+from tilestream.pipeline.engine.outputs import Parquet, TileArrays, way_to
 from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.engine.stage import Task
 from tilestream.pipeline.stages.drive_scans import DriveScans, Sample
@@ -101,7 +101,8 @@ def make_tables(
     """
     with only_writer(out):
         announce(plan.tasks)
-        outcomes = execute(plan, client, watch)
+        stores = [t.writes.store_url for t in plan.tasks if isinstance(t.writes, TileArrays)]
+        outcomes = execute(plan, client, watch, shared=[place_of(out), *stores])
         failures = {outcome.key: outcome.reason for outcome in outcomes if not outcome.ok}
         settle(plan.tasks, failures)
     return failures

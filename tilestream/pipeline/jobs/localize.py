@@ -3,7 +3,6 @@
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,10 +10,12 @@ import pandas as pd
 
 from tilestream.errors import PartialError, TileNotReadyError, UsageError
 from tilestream.factors.rows import Samples, samples_of_drive
+from tilestream.files import local_path, place_of
 from tilestream.formats.logs import ScanLog, ScanSelection
 from tilestream.formats.motion import along
 from tilestream.grid import Box, TileGrid, TileKey, whole_mm
 from tilestream.label import start_poses
+from tilestream.matcher import RegistrationSettings
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.engine.outputs import Parquet
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, paths_of
@@ -26,7 +27,7 @@ from tilestream.pipeline.stages.label import label
 from tilestream.pipeline.stages.map_plan import MapPlan, apart
 from tilestream.pipeline.stages.register import MARGIN, Measuring, register
 from tilestream.records import Float64, TruePose
-from tilestream.settings import LabelSettings, RegistrationSettings, StartSettings
+from tilestream.settings import LabelSettings, StartSettings
 from tilestream.store import TileStore
 from tilestream.tables import read_tables
 
@@ -136,6 +137,7 @@ def plan_localize(
 
     Where a job has several logs, `group` names this one's labels: part of their keys and paths.
     """
+    registration.require_cells(cell_size)
     reading = _absolute(reading)
     log = opened(reading)
     samples = choose_samples(log, scans, spacing)
@@ -157,7 +159,7 @@ def plan_localize(
             tiles_in_reach(map_plan, places[[sample.scan for sample in part]], reach),
             DriveScans(reading, state, part),
             measuring,
-            os.fspath(out),
+            place_of(out),
             group,
             starts_per_task,
         )
@@ -166,7 +168,7 @@ def plan_localize(
 
 def _absolute(reading: Reading) -> Reading:
     """With the whole path: workers may run elsewhere."""
-    return replace(reading, path=str(Path(reading.path).absolute()))
+    return replace(reading, path=place_of(local_path(reading.path)))
 
 
 def choose_samples(log: ScanLog, scans: ScanSelection, spacing: float) -> tuple[Sample, ...]:

@@ -18,7 +18,7 @@ import joblib
 import yaml
 
 from tilestream.errors import PartialError
-from tilestream.files import Files
+from tilestream.files import Files, place_of
 from tilestream.lock import only_writer
 from tilestream.model.dataset import Dataset
 from tilestream.model.file import load_model
@@ -69,7 +69,7 @@ def run(
     config: RunSettings | str | os.PathLike[str],
     client: Any | None = None,
     watch: Watch | None = None,
-) -> Path:
+) -> Path | str:
     """The whole job: measure errors on drives, learn what the map says of them, estimate all.
 
     Writes a run directory: `map.zarr/`, `tables/` (Parquet with documented columns: `factors`,
@@ -84,7 +84,7 @@ def run(
         watch: is told of each task that ended.
 
     Returns:
-        The run directory.
+        The run directory; of one in an object store its URL.
 
     Raises:
         UsageError: settings that cannot be.
@@ -94,13 +94,14 @@ def run(
         PlanError: a task does not fit `memory`.
         LockedError: another process writes to the run directory, or to the map that is made.
         IncompleteError: the map that is there is not whole, and not `map.partial`.
-        PartialError: some tasks failed, or some routes cannot be used; the message lists them, the
-            rest is done and reported.
+        PartialError: some tasks failed, or some sources, drives or routes cannot be used; the
+            message lists them, the rest is done and reported.
     """
     settings = config if isinstance(config, RunSettings) else read_settings(config)
     check_model(settings)
-    with only_writer(settings.folder), _map_alone(settings):
-        return _run(settings, client, watch)
+    with only_writer(settings.out), _map_alone(settings):
+        _run(settings, client, watch)
+    return Path(settings.out) if settings.folder.local else settings.out
 
 
 def _map_alone(settings: RunSettings) -> AbstractContextManager[None]:
@@ -109,17 +110,19 @@ def _map_alone(settings: RunSettings) -> AbstractContextManager[None]:
     return only_writer(settings.store_url) if makes else nullcontext()
 
 
-def _run(settings: RunSettings, client: Any | None, watch: Watch | None) -> Path:
+def _run(settings: RunSettings, client: Any | None, watch: Watch | None) -> None:
     """The whole job, of the one process that may write the run directory."""
     book = _begin(settings)
     with book.closed():
-        with report_kept(client, settings.folder / "dask-performance.html"):
+        with report_kept(client, settings.folder.under("dask-performance.html").address):
             inputs = inputs_of(settings, client, watch)
             book.failures |= inputs.failures
             story = _Story(settings, inputs, book)
             inputs = story.inputs
             book.facts["notes"] = dict(inputs.notes)
-            execute(story.first(), client, book.listening(watch), grow=story.grown)
+            shared = [settings.out, story.store.url]
+            first = story.first()
+            execute(first, client, book.listening(watch), grow=story.grown, shared=shared)
             if story.estimate is None:
                 story.estimate = story.plan_estimate()
                 book.tasks += story.estimate.tasks
@@ -130,13 +133,12 @@ def _run(settings: RunSettings, client: Any | None, watch: Watch | None) -> Path
         _report(settings, inputs, story, book)
     book.facts["files"] = checksums(settings.folder)
     for name in ("", "tables", "report", "report/figures"):
-        Files.at(settings.folder).under(name).remove_parts()
+        settings.folder.under(name).remove_parts()
     book.write("failed" if book.failures else "done")
     if book.failures:
         raise PartialError(
             f"{settings.out}: {len(book.failures)} failed, the rest is done:", book.failures
         )
-    return settings.folder
 
 
 def dataset(run_dir: str | os.PathLike[str]) -> Dataset:
@@ -152,14 +154,14 @@ def dataset(run_dir: str | os.PathLike[str]) -> Dataset:
     Raises:
         SourceNotFoundError: no dataset there.
     """
-    return DatasetFile(f"{os.fspath(run_dir)}/tables/samples/dataset.parquet").read()
+    return DatasetFile(f"{place_of(run_dir)}/tables/samples/dataset.parquet").read()
 
 
 def _begin(settings: RunSettings) -> Book:
     """The run directory with the effective settings."""
     text = yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
-    write_text(settings.folder / "config.yaml", text)
-    book = Book(settings.folder, told_before(settings.folder / RECORD))
+    write_text(settings.folder.under("config.yaml"), text)
+    book = Book(settings.folder, told_before(settings.folder.under(RECORD)))
     book.write("running")
     return book
 
@@ -227,6 +229,7 @@ class _Story:
     def _measured(self, map_plan: MapPlan) -> tuple[Task, ...]:
         """The tasks that measure; tables of other settings are removed before."""
         self.measure = plan_measure(self.settings, self.inputs, map_plan)
+        self.book.failures |= self.measure.left_out
         announce(self.measure.tasks)
         _remove_other_groups(self.settings, self.measure)
         self._open = {task.key for task in self.measure.tasks}
@@ -297,9 +300,9 @@ def _report(settings: RunSettings, inputs: Inputs, story: _Story, book: Book) ->
         found, notes=book.facts["notes"], drives=measured, lost_labels=lost_labels(known)
     )
     text = json.dumps(plain(evaluation), indent=1, allow_nan=False)
-    write_text(settings.folder / "tables" / "evaluation.json", text + "\n")
-    write_report(found, settings.folder / "report", threshold=settings.report.threshold)
-    book.facts["report"] = str(settings.folder / "report" / "index.html")
+    write_text(settings.folder.under("tables/evaluation.json"), text + "\n")
+    write_report(found, f"{settings.out}/report", threshold=settings.report.threshold)
+    book.facts["report"] = f"{settings.out}/report/index.html"
 
 
 def _facts(
@@ -336,4 +339,4 @@ def _model_facts(settings: RunSettings, book: Book) -> dict[str, Any]:
         return {"from": settings.model.use, **load_model(settings.model.use).facts}
     if not any(outcome.stage == "train" and outcome.ok for outcome in book.outcomes):
         return {"from": "none: it could not be trained", "recipe": settings.model.recipe}
-    return {"from": "trained here", **load_model(settings.folder / "model.skops").facts}
+    return {"from": "trained here", **load_model(f"{settings.out}/model.skops").facts}

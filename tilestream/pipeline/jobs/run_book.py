@@ -11,7 +11,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,7 +32,8 @@ WRITE_EVERY = 30.0
 class Book:
     """What a run did so far; `run.json` is made from it."""
 
-    folder: Path
+    folder: Files
+    """The run directory."""
     earlier: Mapping[str, Any] = field(default_factory=dict)
     """What it said after the calls before this one."""
     began: float = field(default_factory=time.time)
@@ -87,7 +87,7 @@ class Book:
             **self.facts,
         }
         plain = json.loads(json.dumps(content, default=str))
-        write_text(self.folder / RECORD, json.dumps(sealed(plain), indent=2) + "\n")
+        write_text(self.folder.under(RECORD), json.dumps(sealed(plain), indent=2) + "\n")
         self.written = time.time()
         return content
 
@@ -120,23 +120,19 @@ class Book:
         return table
 
 
-def told_before(path: Path) -> dict[str, Any]:
+def told_before(record: Files) -> dict[str, Any]:
     """The record of earlier calls; empty where there is none, or it is not what was written."""
     try:
-        return unsealed(json.loads(path.read_text()))
+        return unsealed(json.loads(record.read()))
     except (OSError, ValueError, AttributeError):
         return {}
 
 
-def checksums(folder: Path) -> dict[str, str]:
+def checksums(folder: Files) -> dict[str, str]:
     """The checksums of what a run writes besides its tables, by path in the run directory."""
     names = ["config.yaml", "model.skops", "tables/evaluation.json"]
-    names += sorted(
-        str(path.relative_to(folder)) for path in (folder / "report").rglob("*") if path.is_file()
-    )
-    return {
-        name: checksum_of(Files.at(folder / name)) for name in names if (folder / name).exists()
-    }
+    names += [f"report/{name}" for name in folder.under("report").all_files()]
+    return {name: checksum_of(folder.under(name)) for name in names if folder.under(name).there()}
 
 
 def checksum_of(file: Files) -> str:
@@ -144,9 +140,9 @@ def checksum_of(file: Files) -> str:
     return f"{zlib.crc32(file.read()):08x}"
 
 
-def write_text(path: Path, text: str) -> None:
+def write_text(file: Files, text: str) -> None:
     """Write a text file: whole, or as it was."""
-    Files.at(path).write(text.encode())
+    file.write(text.encode())
 
 
 def machine() -> dict[str, Any]:

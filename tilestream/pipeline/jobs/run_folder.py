@@ -6,6 +6,7 @@ from pathlib import Path
 import pandas as pd
 
 from tilestream.errors import StoreNotFoundError
+from tilestream.files import Files
 from tilestream.pipeline.jobs.inventory import tables_in
 from tilestream.store import TileStore, open_store
 from tilestream.tables import read_mark, read_tables
@@ -21,20 +22,20 @@ def map_of(place: str | os.PathLike[str]) -> TileStore:
         StoreNotFoundError: nothing there, or the map has moved; says how to name its new place.
         StoreError: something else lies there.
     """
-    inside = Path(place) / "map.zarr"
-    if inside.is_dir():
-        return open_store(str(inside))
+    inside = Files.at(place).under("map.zarr")
+    if inside.there():
+        return open_store(inside.address)
     made_from_it = [*table_paths(place, "starts"), *table_paths(place, "factors")]
     if not made_from_it:
-        return open_store(os.fspath(place))
-    named = read_mark(made_from_it[0]).facts.get("store", str(inside.absolute()))
+        return open_store(place)
+    named = read_mark(made_from_it[0]).facts.get("store", inside.address)
     if "://" not in named:
         named = os.path.normpath(Path(made_from_it[0]).parent.absolute() / named)
     try:
         return open_store(named)
     except StoreNotFoundError as error:
         raise StoreNotFoundError(
-            f"{error}; if the map of {place} is elsewhere now, link {inside} to it"
+            f"{error}; if the map of {place} is elsewhere now, link {inside.address} to it"
         ) from None
 
 
@@ -46,8 +47,9 @@ def rows_of(place: str | os.PathLike[str], table: str) -> pd.DataFrame | None:
 
 def table_paths(place: str | os.PathLike[str], table: str) -> list[str]:
     """The files of a table of a run directory, sorted: of the main job, or of a command alone."""
+    root = Files.at(place).address
     return [
         path
-        for folder in (Path(place) / "tables" / table, Path(place) / table)
-        for path in tables_in(str(folder))
+        for folder in (f"{root}/tables/{table}", f"{root}/{table}")
+        for path in tables_in(folder)
     ]

@@ -1,5 +1,6 @@
 """What the main job works on: its settings and files."""
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from glob import glob
@@ -7,15 +8,16 @@ from pathlib import Path
 from typing import Any
 
 from tilestream.errors import ModelError, SourceNotFoundError, UsageError
+from tilestream.files import Files
 from tilestream.formats.logs import ScanSelection, is_log
-from tilestream.formats.routes import RoutesRead, read_all_routes, together
+from tilestream.formats.routes import RoutesRead, read_all_routes, read_each
 from tilestream.model.dataset import made_with
 from tilestream.model.file import load_model
 from tilestream.model.training import check_making
 from tilestream.notes import Notes, noticed
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.jobs.ingest import Reading, read_sources
-from tilestream.pipeline.jobs.run_settings import RunSettings
+from tilestream.pipeline.jobs.run_settings import RunSettings, one_of_each
 from tilestream.pipeline.jobs.simulate import simulate
 from tilestream.pipeline.jobs.sources import crs_of_map
 from tilestream.pipeline.stages.drive_scans import Reading as DriveReading
@@ -67,12 +69,13 @@ def inputs_of(settings: RunSettings, client: Any | None, watch: Watch | None) ->
         SourceError: a file that is not there, or none of the routes can be used.
     """
     if settings.simulate is None:
-        drives = settings.drives
+        drives, again = one_of_each(settings.drives)
         files = settings.routes or tuple(dict.fromkeys(drive.log for drive in drives))
         if not files:
             return _inputs(settings.map.sources, drives, *_all_streets(settings))
         read = _routes(files, settings, settings.map.sources).at_least(settings.spacing)
-        return _inputs(settings.map.sources, drives, read, files, {JOB: _other_lidars(settings)})
+        told = {JOB: [*again, *_other_lidars(settings)]}
+        return _inputs(settings.map.sources, drives, read, files, told)
     folder = simulated_folder(settings)
     wanted = settings.simulate
     for drive in simulations(wanted):
@@ -147,9 +150,16 @@ ATTRIBUTION = (
 
 
 def simulated_folder(settings: RunSettings) -> Path:
-    """Where a simulated city is kept."""
+    """Where a simulated city is kept.
+
+    Raises:
+        UsageError: nowhere on a disk.
+    """
     assert settings.simulate is not None
-    return Path(settings.simulate.folder or settings.folder / "simulation")
+    folder = settings.simulate.folder
+    if folder is None and not settings.folder.local:
+        raise UsageError(f"{settings.out}: a city is simulated to a disk: give simulate.folder")
+    return Path(folder or f"{settings.out}/simulation")
 
 
 LANES = "lanelet2_map.osm"
@@ -190,16 +200,14 @@ def _routes(files: Sequence[str], settings: RunSettings, sources: Sequence[str])
     from these sources. A log that is no drive is read as those of the map.
     """
     map_crs = crs_of_map(sources, settings.store_url, settings.map.crs)
-    of_log = {drive.log: drive for drive in reversed(settings.drives)}
-    parts = []
+    of_log = {os.path.realpath(drive.log): drive for drive in reversed(settings.drives)}
+    wanted = []
     for path in files:  # the way of a drive is that of its own poses
-        drive = of_log.get(path)
+        drive = of_log.get(os.path.realpath(path))
         options = (settings.map if drive is None else drive).log_options
-        project_to = settings.project_to
-        parts.append(
-            read_all_routes(path, project_to=project_to, map_crs=map_crs, log_options=options)
-        )
-    return together(parts)
+        how = {"project_to": settings.project_to, "map_crs": map_crs, "log_options": options}
+        wanted.append((path, how))
+    return read_each(wanted, read_all_routes)
 
 
 def read_map(settings: RunSettings, inputs: Inputs) -> Reading | None:
@@ -333,7 +341,7 @@ def check_model(settings: RunSettings) -> None:
     """
     if settings.model.use is None:
         return
-    if not Path(settings.model.use).is_file():
+    if not Files.at(settings.model.use).there():
         raise SourceNotFoundError(f"{settings.model.use}: no such model file; see model.use")
     try:
         check_making(load_model(settings.model.use), making_of(settings))

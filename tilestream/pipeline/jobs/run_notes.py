@@ -6,8 +6,9 @@ from typing import Any
 
 import pandas as pd
 
+from tilestream.errors import SourceError
 from tilestream.model.dataset import Dataset
-from tilestream.notes import noticed
+from tilestream.notes import MATCHER, noticed
 from tilestream.pipeline.engine.outputs import Parquet
 from tilestream.pipeline.jobs.along_routes import off_map
 from tilestream.pipeline.jobs.drive_measured import to_measure, with_labels
@@ -44,13 +45,15 @@ def with_logs(
 
     Raises:
         UsageError: scans that are to be localized are in the map, and not `allow_overlap`.
-        SourceError: a log that cannot be read.
     """
     notes: list[dict[str, list[str]]] = []
     found = []
     for drive in inputs.drives:
         reading, scans, spacing = reading_of(drive), scans_of(drive), settings.spacing
-        log, shared = opened(reading), drive_overlap(reading, scans, spacing, sources)
+        try:
+            log, shared = opened(reading), drive_overlap(reading, scans, spacing, sources)
+        except (SourceError, OSError):  # it is left out, see `plan_measure`
+            continue
         if not settings.label.allow_overlap:
             shared.require_none()
         notes.append({drive.log: [*log.notes, *shared.notes]})
@@ -60,7 +63,7 @@ def with_logs(
 
 def run_notes(settings: RunSettings, inputs: Inputs, store: TileStore) -> dict[str, list[str]]:
     """All that was noticed of the inputs of a run whose map is there, by source."""
-    own = {JOB: _on_degraded(settings, inputs)}
+    own = {JOB: _on_degraded(settings, inputs), MATCHER: settings.label.registration.notes}
     known = () if store.manifest is None else store.manifest.identities
     far = {"routes": off_map(known, store.grid, inputs.routes)}
     return noticed(inputs.notes, own, far, map_notes(store))

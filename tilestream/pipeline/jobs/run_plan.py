@@ -4,6 +4,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
+from tilestream.errors import SourceError, SourceNotFoundError, TileNotReadyError
 from tilestream.factors import catalogue
 from tilestream.factors.virtual_drive import NEIGHBOURS
 from tilestream.grid import MM_PER_M, TileGrid, TileKey
@@ -38,6 +39,7 @@ from tilestream.pipeline.stages.observe import observe_drive
 from tilestream.pipeline.stages.predict import predict
 from tilestream.pipeline.stages.samples import COLUMNS, DatasetFile, samples
 from tilestream.pipeline.stages.train import ModelFile, ModelInUse, train
+from tilestream.settings import DriveSettings
 
 OF_DRIVES = (factors_drive.name, observe_drive.name)
 """The stages that look from the places of scans."""
@@ -55,40 +57,67 @@ def plan_measure(settings: RunSettings, inputs: Inputs, map_plan: MapPlan) -> Pl
         settings: the job.
         inputs: its files.
         map_plan: the map, as far as it is there or will be.
+
+    Returns:
+        The plan; a drive whose log cannot be read is left out, as long as another can.
+
+    Raises:
+        SourceNotFoundError: there is no such log.
+        SourceError, TileNotReadyError: no drive can be measured; says why the first cannot.
     """
     tables = f"{settings.out}/tables"
     places = samples_along(map_plan.store, inputs.routes, settings.spacing)
     memory = settings.memory
+    localized, left_out = _localized(settings, inputs, map_plan, tables)
+    good = [drive for drive in inputs.drives if drive.group in localized]
     plans = [plan_factors(map_plan, places, tables, looking_of(settings), memory)]
     if settings.observe is not None:
         observing = observing_of(settings, settings.observe)
         plans.append(plan_observe(map_plan, places, tables, observing, memory))
-    plans += _plans_of_drives(settings, inputs, map_plan)
-    plans += [
-        plan_localize(
-            map_plan,
-            reading_of(drive),
-            tables,
-            cell_size=settings.cell_size,
-            spacing=settings.spacing,
-            registration=settings.label.registration,
-            starts=settings.label.starts,
-            true_pose=settings.label.true_pose,
-            scans=scans_of(drive),
-            starts_per_task=None,
-            memory=memory,
-            group=drive.group,
-        )
-        for drive in inputs.drives
-    ]
-    return Plan.of((task for plan in plans for task in plan.tasks), memory)
+    plans += _plans_of_drives(settings, good, map_plan)
+    plans += localized.values()
+    measured = Plan.of((task for plan in plans for task in plan.tasks), memory)
+    return replace(measured, left_out=left_out)
 
 
-def _plans_of_drives(settings: RunSettings, inputs: Inputs, map_plan: MapPlan) -> Iterator[Plan]:
+def _localized(
+    settings: RunSettings, inputs: Inputs, map_plan: MapPlan, tables: str
+) -> tuple[dict[str, Plan], dict[str, str]]:
+    """What measures each drive, by its name, and why others cannot be measured."""
+    plans: dict[str, Plan] = {}
+    errors: dict[str, SourceError | TileNotReadyError | OSError] = {}
+    for drive in inputs.drives:
+        try:
+            plans[drive.group] = plan_localize(
+                map_plan,
+                reading_of(drive),
+                tables,
+                cell_size=settings.cell_size,
+                spacing=settings.spacing,
+                registration=settings.label.registration,
+                starts=settings.label.starts,
+                true_pose=settings.label.true_pose,
+                scans=scans_of(drive),
+                starts_per_task=None,
+                memory=settings.memory,
+                group=drive.group,
+            )
+        except SourceNotFoundError:
+            raise
+        except (SourceError, TileNotReadyError, OSError) as error:
+            errors[f"drive {drive.group}"] = error
+    if errors and not plans:
+        raise next(iter(errors.values()))
+    return plans, {name: str(error) for name, error in errors.items()}
+
+
+def _plans_of_drives(
+    settings: RunSettings, drives: Sequence[DriveSettings], map_plan: MapPlan
+) -> Iterator[Plan]:
     """The factors and the virtual drives at the places of the scans that are labelled; as the lidar
     that the drive is read as.
     """
-    for drive in inputs.drives:
+    for drive in drives:
         grid, reading, scans = map_plan.store.grid, reading_of(drive), scans_of(drive)
         places = labelled_places(grid, reading, scans, settings.spacing, drive.group)
         folder, memory = f"{settings.out}/tables/drives/{drive.group}", settings.memory
@@ -204,7 +233,7 @@ def _training(settings: RunSettings, joined: Task) -> Task:
     return Task(
         train,
         "model",
-        ModelFile(str(settings.folder / "model.skops")),
+        ModelFile(f"{settings.out}/model.skops"),
         takes={"recipe": settings.model.recipe, "seed": settings.model.seed},
         reads={"dataset": joined.product},
         counts=joined.counts,

@@ -2,21 +2,25 @@
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from tilestream.bounded_yaml import parse_yaml, read_yaml
 from tilestream.config import Settings
 from tilestream.errors import SourceNotFoundError, UsageError, foreign_errors
+from tilestream.files import Files, local_path
+from tilestream.matcher import RegistrationSettings, matcher_named
 from tilestream.model.registry import COMPETITORS, DEFAULT, RECIPES, UNTRAINED
 from tilestream.settings import (
     NAME,
     DriveSettings,
     LabelSettings,
+    LocalFile,
     MapSettings,
+    Place,
     PlaceSettings,
     ReportSettings,
     SimulateSettings,
@@ -48,7 +52,7 @@ class ModelSettings(Settings):
     recipe: Recipe = DEFAULT
     offset: Annotated[float, Field(ge=0.0)] = 0.0
     """With `physics`: what a real scan adds to the error of a virtual one [m]."""
-    use: str | None = None
+    use: Place | None = None
     """A model file to use instead of training; null: train on the drives."""
     seed: int = 0
     """Seed of all that is random in training."""
@@ -62,15 +66,15 @@ class ModelSettings(Settings):
 class RunSettings(PlaceSettings):
     """The main job: from map and drives to the estimated error of every sample point."""
 
-    out: str
-    """The run directory."""
+    out: Place
+    """The run directory: a path, or a URL of an object store."""
     simulate: SimulateSettings | None = None
     """Simulate a city; null: real files."""
     map: MapSettings = MapSettings()
     """The map."""
     drives: tuple[DriveSettings, ...] = ()
     """The logs to measure on; empty with `simulate`: its drives."""
-    routes: tuple[str, ...] = ()
+    routes: tuple[LocalFile, ...] = ()
     """Files of routes to estimate along; empty: those of the simulation, or of the drives; without
     drives, all lanes of a map directory with `lanelet2_map.osm` among the sources."""
     observe: VirtualSettings | None = VirtualSettings()
@@ -83,6 +87,30 @@ class RunSettings(PlaceSettings):
     report: ReportSettings = ReportSettings()
     """What is reported."""
 
+    @model_validator(mode="before")
+    @classmethod
+    def _cells_of_the_matcher(cls, values: Any) -> Any:
+        """The cells that the matcher wants, where it wants some."""
+        label = values.get("label") if isinstance(values, Mapping) else None
+        if isinstance(label, LabelSettings):
+            label = {name: getattr(label, name) for name in label.model_fields_set}
+        if not isinstance(label, Mapping):
+            return values
+        try:
+            matcher = matcher_named(label.get("matcher"))
+        except UsageError:  # which is told where the matcher is
+            return values
+        wanted = matcher.get("resolution") if isinstance(matcher, Mapping) else None
+        wanted = matcher.resolution if isinstance(matcher, RegistrationSettings) else wanted
+        if wanted is None:
+            return values
+        if values.get("cell_size", wanted) != wanted:
+            raise ValueError(
+                f"has cell_size {values['cell_size']} and a matcher of {wanted} m (its resolution):"
+                " leave cell_size out, or give the same"
+            )
+        return {**values, "label": {**label, "matcher": matcher}, "cell_size": wanted}
+
     @model_validator(mode="after")
     def _check(self) -> Self:
         for drive in self.drives:
@@ -91,7 +119,7 @@ class RunSettings(PlaceSettings):
                     f"has a drive that {drive.log!r} cannot name: give it a name of letters, digits"
                     " and _ . + - or spaces, the first a letter, a digit or _"
                 )
-        names = [drive.group for drive in self.drives]
+        names = [drive.group for drive in one_of_each(self.drives)[0]]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise ValueError(f"has two drives named {', '.join(twice)}: give each its own name")
@@ -107,14 +135,30 @@ class RunSettings(PlaceSettings):
         return self
 
     @property
-    def folder(self) -> Path:
+    def folder(self) -> Files:
         """The run directory."""
-        return Path(self.out)
+        return Files.at(self.out)
 
     @property
     def store_url(self) -> str:
         """Where the tile store is."""
-        return self.map.store or str(self.folder / "map.zarr")
+        return self.map.store or f"{self.out}/map.zarr"
+
+
+def one_of_each(drives: Sequence[DriveSettings]) -> tuple[tuple[DriveSettings, ...], list[str]]:
+    """The drives without those that are another one again, whatever the name of drive and log, and
+    a note on each of these.
+    """
+    first: dict[tuple[str, str], DriveSettings] = {}
+    notes = []
+    for drive in drives:
+        how = drive.model_dump_json(exclude={"log", "name"})
+        before = first.setdefault((os.path.realpath(drive.log), how), drive)
+        if before is not drive:
+            notes.append(
+                f"Drive {drive.group}, {drive.log}, is drive {before.group} again: measured once."
+            )
+    return tuple(first.values()), notes
 
 
 def read_settings(path: str | os.PathLike[str], changes: Sequence[str] = ()) -> RunSettings:
@@ -129,7 +173,7 @@ def read_settings(path: str | os.PathLike[str], changes: Sequence[str] = ()) -> 
         UsageError: no YAML, an unknown key at any level (names the nearest right one), a value that
             cannot be.
     """
-    place = Path(path)
+    place = Path(local_path(path))
     if not place.is_file():
         raise SourceNotFoundError(f"{place}: no such config; `tilestream template` prints one")
     values = read_yaml(place, UsageError)

@@ -12,7 +12,7 @@ import yaml
 
 from tilestream.bounded_yaml import read_yaml
 from tilestream.errors import PartialError, PlanError, UsageError
-from tilestream.files import Files
+from tilestream.files import Files, local_path, place_of
 from tilestream.lock import only_writer
 from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.plan import Plan
@@ -83,7 +83,7 @@ def simulate(
         LockedError: another process writes to the directory.
         PartialError: some tasks failed; the message lists them, the rest is there.
     """
-    folder = Path(out)
+    folder = Path(place_of(local_path(out)))
     plan = plan_simulation(
         settings, folder, paths=paths, scans_per_point=scans_per_point, size=size
     )
@@ -96,7 +96,7 @@ def simulate(
         check_clear(street, city.footprints)
     with only_writer(folder):
         _begin(folder, city, identity)
-        outcomes = execute(plan, client, watch)
+        outcomes = execute(plan, client, watch, shared=[str(folder)])
         failures = {outcome.key: outcome.reason for outcome in outcomes if not outcome.ok}
         for name in ("", "survey", f"logs/drive{settings.drive}"):
             Files.at(folder).under(name).remove_parts()
@@ -122,7 +122,7 @@ def plan_simulation(
     """
     if scans_per_point < 1 or scans_per_point > 64:
         raise UsageError(f"scans_per_point is {scans_per_point}: give 1 to 64")
-    folder, settings = Path(out), _sized(settings, size)
+    folder, settings = Path(place_of(local_path(out))), _sized(settings, size)
     city = SimulatedCity(settings.model_dump_json())
     streets = read_streets(data_file(settings.city.routes))
     if paths is not None:

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from tilestream.crs import named, one_crs
-from tilestream.errors import SourceError, SourceNotFoundError, StoreNotFoundError, UsageError
-from tilestream.formats import expand_sources, open_source
+from tilestream.errors import SourceError, StoreNotFoundError, UsageError
+from tilestream.files import place_of
+from tilestream.formats import files_of, matches_of, open_source
 from tilestream.formats.base import SourceInfo, Span
 from tilestream.formats.drive import DriveSource
 from tilestream.formats.logs import ScanSelection, is_log
@@ -90,39 +91,51 @@ def examine_all(
         sources = [sources]
     of_logs = {} if log_options is None else log_options.given
     of_logs |= {} if scans is None else {"scans": scans}
-    found: dict[str, Source] = {}
-    for pattern in [os.fspath(source) for source in sources]:
+    by_place: dict[str, list[str]] = {}
+    found: list[Source] = []
+    for match in [match for pattern in sources for match in matches_of(pattern)]:
         try:
-            paths = expand_sources(pattern)
-        except SourceNotFoundError:
-            raise
-        except SourceError as error:
-            found[pattern] = Source(pattern, state="", reason=str(error))
+            files = files_of(match)
+        except (SourceError, OSError) as error:
+            found.append(Source(place_of(match), state="", reason=str(error)))
             continue
-        for path in paths:
-            noise = {"keep_noise": True} if settings.keep_noise else {}
-            options = of_logs if is_log(path) else noise
-            absolute = str(Path(path).absolute())
-            found.setdefault(absolute, _examine(absolute, options))
+        for file in files:
+            by_place.setdefault(os.path.realpath(file), []).append(place_of(file))
+    for paths in by_place.values():
+        noise = {"keep_noise": True} if settings.keep_noise else {}
+        found.append(_examine(paths, of_logs if is_log(paths[0]) else noise))
     if not found:
         raise UsageError("no sources: name at least one file, glob or map directory")
-    return [found[path] for path in sorted(found)]
+    return sorted(found, key=lambda source: source.path)
 
 
-def _examine(path: str, options: dict[str, Any]) -> Source:
-    """Open a source as far as its header; a failure is its reason, not an exception."""
+def _examine(paths: Sequence[str], options: dict[str, Any]) -> Source:
+    """Open a source as far as its header; a failure is its reason, not an exception.
+
+    Args:
+        paths: its names; more than one: it was named so often.
+        options: how it is read.
+    """
+    path, *others = paths
     readable = tuple(sorted(options.items()))
-    known = Source(path, hash_of(*state_of(path), repr(readable)), options=readable)
+    known = Source(path, "", options=readable)
     try:
+        if not Path(path).exists():
+            open_source(path)  # which says why
+        state = hash_of(*state_of(path), repr(readable))
         source = open_source(path, **options)
         info = source.info()
         spans = tuple(source.spans(POINTS_PER_TASK))
     except (SourceError, OSError) as error:
         return replace(known, reason=str(error))
+    if others:
+        again = ", ".join(dict.fromkeys(other for other in others if other != path))
+        told = f"named {len(paths)} times{f', also as {again}' if again else ''}: read once"
+        info = replace(info, notes=(*info.notes, told))
     scans = ""
     if isinstance(source, DriveSource):
         scans = packed(source.log.stamps_ns[source.used], source.log.point_counts[source.used])
-    return replace(known, info=info, spans=spans, scans=scans)
+    return replace(known, state=state, info=info, spans=spans, scans=scans)
 
 
 def within(found: Sequence[Source], memory: int) -> list[Source]:
@@ -202,4 +215,4 @@ def _without_logs(sources: Iterable[str]) -> Iterator[str]:
         if not is_log(source):
             yield source
         elif not Path(source).exists():
-            yield from (path for path in expand_sources(source) if not is_log(path))
+            yield from (path for path in matches_of(source) if not is_log(path))

@@ -1,6 +1,7 @@
 """The scans of a drive as a task reads them, as if by the sensor that is asked for."""
 
 import math
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from functools import lru_cache
@@ -67,10 +68,12 @@ class Reading:
 
     @property
     def state(self) -> str:
-        """Hash of the log as it is now, and of how it is read. Options that are not given are left
-        out, so that one more of them changes no hash.
+        """Hash of the log as it is now, and of how it is read; wherever it lies: a job whose files
+        have moved has not to measure anew. Options that are not given are left out, so that one
+        more of them changes no hash.
         """
         own = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "options"}
+        own["path"] = os.path.basename(os.path.realpath(self.path))  # noqa: PTH119
         topics = {"points_topic": None, "pose_topic": None}
         how: dict[str, Any] = {**own, **topics, **self.options.given}
         return hash_of(how, *state_of(self.path))

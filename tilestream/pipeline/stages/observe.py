@@ -6,13 +6,14 @@ from tilestream.factors.observability import COLUMNS, MARGIN, observability
 from tilestream.factors.rows import PLACE_COLUMNS, STATUS_COLUMNS, Samples, sample_rows, with_places
 from tilestream.grid import Box, TileKey, whole_mm
 from tilestream.marks import canonical
+from tilestream.matcher import RegistrationSettings
 from tilestream.pipeline.engine.outputs import Made, Parquet
 from tilestream.pipeline.engine.stage import Stage, Task, stage
 from tilestream.pipeline.stages.map_part import MapPart
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.records import RouteZ
 from tilestream.sensor import Carrier, rim_of
-from tilestream.settings import RegistrationSettings, VirtualSettings
+from tilestream.settings import VirtualSettings
 
 FIXED_BYTES = 600_000_000
 """Memory of the task besides what it reads: a scene, the registrations, and the terms that factors

@@ -14,13 +14,14 @@ from tilestream.grid import Box, TileKey
 from tilestream.kernels.fixed_order import norms
 from tilestream.label import FINE_CELL, refined_pose, start_errors, start_poses
 from tilestream.marks import canonical
+from tilestream.matcher import RegistrationSettings
 from tilestream.pipeline.engine.outputs import Made
 from tilestream.pipeline.engine.stage import stage
 from tilestream.pipeline.stages.drive_scans import OpenedScans
 from tilestream.pipeline.stages.map_part import MapPart
 from tilestream.records import Cells, Column, Float64, Scan, TruePose
 from tilestream.registration import register as register_scan
-from tilestream.settings import RegistrationSettings, StartSettings
+from tilestream.settings import StartSettings
 from tilestream.store import open_store
 
 MARGIN = 10.0

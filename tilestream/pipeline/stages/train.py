@@ -4,9 +4,9 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path
 
 from tilestream.errors import ModelError, SourceNotFoundError
+from tilestream.files import Files
 from tilestream.model.dataset import Dataset
 from tilestream.model.file import load_model, save_model
 from tilestream.model.training import Model
@@ -66,7 +66,7 @@ class ModelInUse:
 
 def file_hash(path: str) -> str:
     """Hash of a file's bytes."""
-    return hashlib.blake2b(Path(path).read_bytes(), digest_size=16).hexdigest()
+    return hashlib.blake2b(Files.at(path).read(), digest_size=16).hexdigest()
 
 
 @lru_cache(maxsize=1)
