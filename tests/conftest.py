@@ -40,6 +40,8 @@ LONG = (
     "report_page",
     "readme",
     "cases_route",
+    "log_frames",
+    "rosbag2",
     "store",
     "factors_route",
     "localize_drive",

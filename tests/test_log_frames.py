@@ -5,7 +5,7 @@ from pathlib import Path
 import logs
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from logs import SECOND, START, pose
 from scipy.spatial.transform import Rotation
@@ -119,6 +119,7 @@ def test_a_way_has_a_pose_where_all_that_moves_on_it_has_one(tmp_path: Path) -> 
 
 
 @given(st.integers(0, 10**6))
+@settings(max_examples=25)
 def test_a_log_in_odom_is_the_log_in_the_map(
     tmp_path_factory: pytest.TempPathFactory, seed: int
 ) -> None:
@@ -334,6 +335,22 @@ def test_two_that_publish_other_poses_of_one_frame_are_noticed(
     is_at(opened(tmp_path, one, *unused, clouds()), T)
 
 
+def test_turning_round_and_swaying_is_no_other_publisher(tmp_path: Path) -> None:
+    """A vehicle in a narrow place, a pose every second; a lidar that is carried, ten in one."""
+    slow = START + np.arange(SCANS) * SECOND
+    there_and_back = [pose(x=1.5 * (i % 2)) for i in range(SCANS)]
+    swaying = [
+        pose(x=0.1 * i, yaw=np.radians(2.0) * np.sin(6.0 * np.pi * i / 10)) for i in range(SCANS)
+    ]
+    for stamps, T in ((slow, there_and_back), (STAMPS, swaying)):
+        log = opened(
+            tmp_path,
+            [logs.odometry_at(t, at) for t, at in zip(stamps.tolist(), T, strict=True)],
+            [logs.cloud_at(t) for t in stamps.tolist()],
+        )
+        is_at(log, np.array(T))
+
+
 def test_two_that_publish_the_same_are_one(tmp_path: Path) -> None:
     T = moving(0)
     one = odometries(T, "map", "lidar")
@@ -418,8 +435,8 @@ def test_a_job_reads_each_log_by_its_own_frames(tmp_path: Path) -> None:
     drive = {"log": str(path), "map_frame": "odom"}
     of_drive = RunSettings(**made, map=sources, drives=[drive])
     of_map = RunSettings(**made, map={**sources, "map_frame": "odom"}, routes=[str(path)])
-    for settings in (of_drive, of_map):
-        (route,) = inputs_of(settings, None, None).routes
+    for job in (of_drive, of_map):
+        (route,) = inputs_of(job, None, None).routes
         np.testing.assert_allclose(route.positions[0, :2], moving(0)[0, :2, 3])
     neither = RunSettings(**made, map=sources, drives=[{"log": str(path)}])
     with pytest.raises(SourceError, match=r"--map-frame odom\) if the map"):

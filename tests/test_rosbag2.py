@@ -8,7 +8,7 @@ import bags
 import logs
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from logs import SECOND, START, pose
 from points import far_points
@@ -52,6 +52,7 @@ def bag(request: pytest.FixtureRequest, whole: Path, tmp_path: Path) -> Path:
     return bags.split_in(tmp_path / "bag", bags.messages_of(whole), 3, request.param)
 
 
+@settings(max_examples=25)
 @given(files=st.integers(1, 25), seed=st.integers(0, 10**6))
 def test_a_log_in_any_number_of_files_is_the_log(
     tmp_path_factory: pytest.TempPathFactory, whole: Path, files: int, seed: int

@@ -18,6 +18,8 @@ APART_M, APART_DEG = 0.1, 1.0
 OFTEN = 0.05
 """Share of the poses that go back and forth, or are another at the same time, from which on there
 are two publishers."""
+HARDEST = (15.0, 2000.0)
+"""No vehicle, nor a lidar that is carried, is turned round harder [m/s^2, deg/s^2]."""
 AT_LEAST = 3
 """So many go back and forth at least."""
 
@@ -103,18 +105,21 @@ def _check_one_publisher(path: str, what: str, stamps_ns: Int64, numbers: Float6
     """Refuse poses that go back and forth, or that are others at the same time.
 
     A vehicle does not leave by more than `APART_M` or `APART_DEG` and come back to half of it
-    within two steps; that often, the poses are those of two publishers in turn.
+    within two steps, at an acceleration beyond `HARDEST`; that often, the poses are those of two
+    publishers in turn.
     """
     usable = np.isfinite(numbers).all(axis=1) & (np.abs(numbers[:, 3:]).sum(axis=1) > 1e-6)
     order = np.argsort(stamps_ns[usable], kind="stable")
     T, times = matrices(numbers[usable][order]), stamps_ns[usable][order]
     metres, degrees = apart(T[:-1], T[1:])
     twice = beyond(metres, degrees) & (np.diff(times) == 0)
-    far = np.maximum(metres / APART_M, degrees / APART_DEG)
-    left_m, left_deg = apart(T[:-2], T[2:])
-    left = np.maximum(left_m / APART_M, left_deg / APART_DEG)
-    there = np.minimum(far[:-1], far[1:]) if len(far) > 1 else far[:0]
-    back = (there > 1.0) & (left < 0.5 * there)
+    seconds = (times[2:] - times[:-2]) / 2e9
+    back = np.zeros(len(seconds), dtype=bool)
+    for steps, left, least, hardest in zip(
+        (metres, degrees), apart(T[:-2], T[2:]), (APART_M, APART_DEG), HARDEST, strict=True
+    ):
+        there = np.minimum(steps[:-1], steps[1:])
+        back |= (there > least) & (left < 0.5 * there) & (2.0 * there > hardest * seconds**2)
     many = OFTEN * len(T)
     if twice.sum() > many or back.sum() >= max(AT_LEAST, many):
         at = np.flatnonzero(twice)[0] if twice.sum() > many else np.flatnonzero(back)[0]

@@ -105,7 +105,7 @@ def record(
             contents=tuple(f"topic {t.name}: {t.type}, {t.messages} messages" for t in topics),
             points_topic=clouds.name,
             pose_topic=pose_topic,
-            frame=options.lidar_frame or index.frame,
+            frame=(options.lidar_frame or index.frame).lstrip("/"),
             fields=index.fields,
             stamps_ns=np.asarray(index.stamps, dtype=np.int64)[order],
             point_counts=np.asarray(index.counts, dtype=np.int64)[order],
