@@ -115,6 +115,18 @@ def test_a_way_has_a_pose_where_all_that_moves_on_it_has_one(tmp_path: Path) -> 
     np.testing.assert_allclose(log.T_map_lidar[1:9], expected, atol=1e-9)
 
 
+def test_a_vehicle_that_stands_all_the_time(tmp_path: Path) -> None:
+    T_map_base = pose(x=7.0, y=3.0, yaw=1.0)
+    log = opened(
+        tmp_path,
+        [logs.static_tf("base", "lidar", MOUNT)],
+        tf(np.tile(T_map_base, (SCANS, 1, 1)), "map", "base"),
+        clouds(),
+    )
+    is_at(log, np.tile(T_map_base @ MOUNT, (SCANS, 1, 1)))
+    assert log.trajectory.stamps_ns.tolist() == STAMPS.tolist()
+
+
 # --- the map's side
 
 

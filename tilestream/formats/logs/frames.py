@@ -105,12 +105,13 @@ class Frames:
 
     def stamps_of(self, way: Way) -> Int64:
         """The times at which something on a way is given anew; where nothing moves, those at which
-        it is said.
+        it is said again and again, else once.
         """
         links = [self.link(self.given(edge)) for edge in way]
         moving = [link.poses.stamps_ns for link in links if not link.holds]
-        said = [link.poses.stamps_ns for link in links]
-        return np.unique(np.concatenate(moving or said or [np.zeros(0, np.int64)]))
+        once = [link.poses.stamps_ns for link in links]
+        again = [stamps for stamps in once if len(stamps) > 1]
+        return np.unique(np.concatenate(moving or again or once))
 
     def holds(self, way: Way) -> bool:
         """Whether what a way gives holds at all times."""
@@ -200,7 +201,7 @@ class Frames:
         """A second way between two frames has to agree."""
         link, (parent, child) = self._links[edge], edge
         other = self.way(parent, child, without=(edge,))
-        if other is None:
+        if not other:
             return
         stamps = self.stamps_of(other) if link.holds else link.poses.stamps_ns
         T_other, T_link = self.along(other, stamps), link.at(stamps, self.options)
