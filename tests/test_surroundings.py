@@ -101,6 +101,16 @@ def test_workers_see_a_folder_of_this_machine(workers: distributed.Client, tmp_p
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_place_that_nobody_can_write_to_may_be_seen(
+    workers: distributed.Client, tmp_path: Path
+) -> None:
+    if not Path("/proc/self").exists():
+        pytest.skip("needs Linux")
+    require_seen(workers, ["/proc"])
+    with pytest.raises(UsageError, match="does not see /proc/nowhere:"):
+        require_seen(workers, ["/proc/nowhere"])
+
+
 def test_a_worker_that_is_gone_or_has_no_tilestream(tmp_path: Path) -> None:
     def client(**answers: object) -> SimpleNamespace:
         return SimpleNamespace(run=lambda *_, **__: answers)

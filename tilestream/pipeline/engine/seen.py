@@ -2,6 +2,7 @@
 
 import uuid
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 from tilestream.errors import UsageError
@@ -26,7 +27,8 @@ def require_blocking(client: Any) -> None:
 def require_seen(client: Any, places: Sequence[str]) -> None:
     """Refuse workers that do not see the places in which they are to work.
 
-    A small file is written to each and read by every worker that is there now.
+    A small file is written to each and read by every worker that is there now; of a place where
+    none can be written, it is looked whether it is there.
 
     Args:
         client: a Dask client.
@@ -34,23 +36,31 @@ def require_seen(client: Any, places: Sequence[str]) -> None:
 
     Raises:
         UsageError: a worker does not find it, or has no tilestream; says which and where.
-        OSError: it cannot be written.
     """
-    probe = f".seen.{uuid.uuid4().hex}.part"
+    probe = f".seen-{uuid.uuid4().hex}"
     files = [Files.at(place).under(probe) for place in dict.fromkeys(places)]
     try:
-        for file in files:
-            file.write(probe.encode())
-        answers = _answers(client, {file.parent.address: probe for file in files})
+        told = {file.parent.address: _written(file, probe) for file in files}
+        answers = _answers(client, told)
     finally:
         for file in files:
-            file.remove()
+            with suppress(OSError):
+                file.remove()
     for worker, answer in sorted(answers.items()):
         if answer and not isinstance(answer, OSError):  # which says that this worker is gone
             raise UsageError(
                 f"worker {worker}: {answer}: inputs, stores and run directories must lie where all "
                 "workers see them under the same name, and all workers need tilestream"
             )
+
+
+def _written(file: Files, probe: str) -> str:
+    """Write a probe; what it says, nothing where it cannot be written: a map may be read only."""
+    try:
+        file.write(probe.encode())
+    except OSError:
+        return ""
+    return probe
 
 
 def _answers(client: Any, probes: Mapping[str, str]) -> dict[str, Any]:
@@ -68,9 +78,10 @@ def _look(probes: Mapping[str, str]) -> str:
     """Why a worker does not see a place; empty: it sees them all."""
     for place, probe in probes.items():
         try:
-            seen = Files.at(place).under(probe).read() == probe.encode()
+            where = Files.at(place)
+            seen = where.under(probe).read() == probe.encode() if probe else where.there()
         except Exception as error:  # noqa: BLE001 - whatever keeps it from seeing
             return f"does not see {place} ({type(error).__name__}: {error})"
         if not seen:
-            return f"sees another {place}"
+            return f"sees another {place}" if probe else f"does not see {place}"
     return ""
