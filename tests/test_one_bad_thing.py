@@ -221,6 +221,15 @@ def test_a_job_with_a_bad_drive_ends_with_one_and_says_which(
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     assert list(record["failures"]) == ["drive empty"]
     assert (tmp_path / "run" / "report" / "index.html").exists()
+    labels = sorted((tmp_path / "run" / "tables" / "errors" / "canyon").iterdir())
+    (tmp_path / "damaged.mcap").touch()
+    shutil.copy(inputs / "canyon.mcap", tmp_path / "other.mcap")
+    gone = [DriveSettings(log=str(tmp_path / "damaged.mcap"), name="canyon")]
+    other = DriveSettings(log=str(tmp_path / "other.mcap"), until_s=1.0)
+    with pytest.raises(PartialError):
+        ts.run(settings.model_copy(update={"drives": (*gone, other)}))
+    assert sorted((tmp_path / "run" / "tables" / "errors" / "canyon").iterdir()) == labels
+    shutil.rmtree(tmp_path / "run" / "tables" / "errors" / "other")
     assert list((tmp_path / "run" / "tables" / "errors").iterdir()) == [
         tmp_path / "run" / "tables" / "errors" / "canyon"
     ]

@@ -241,7 +241,11 @@ class _Story:
 
 
 def _remove_other_groups(settings: RunSettings, measure: Plan) -> None:
-    """Remove the tables of drives of other settings, so that two jobs are never mixed."""
+    """Remove the tables of drives of other settings, so that two jobs are never mixed.
+
+    Those of a drive whose log cannot be read now are kept: they were hours of work, maybe.
+    """
+    kept = {name.removeprefix("drive ") for name in measure.left_out}
     own = {path.rsplit("/", 1)[0] for path in paths_of(measure.tasks)}
     for kind, below in (
         ("errors", ""),
@@ -251,7 +255,7 @@ def _remove_other_groups(settings: RunSettings, measure: Plan) -> None:
     ):
         for group in Files.at(f"{settings.out}/tables/{kind}").names():
             folder = f"{settings.out}/tables/{kind}/{group}{below}"
-            if folder not in own:
+            if folder not in own and group not in kept:
                 withdraw(folder)
 
 
