@@ -156,6 +156,8 @@ def test_ingest_tells_what_it_left_out(cases: Path, tmp_path: Path, capsys: Told
     command = ["ingest", str(source), "--store", str(tmp_path / "map.zarr")]
     told, _ = asked(command, capsys)
     assert told["whole"]
+    assert set(told["sources"][0]) >= {"path", "format", "points", "contents", "notes", "reason"}
+    assert "scans" not in told["sources"][0]
     (note,) = told["notes"][str(source)]
     assert "1 of 7,716 points" in note
     assert run(command) == 0

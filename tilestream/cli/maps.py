@@ -93,12 +93,14 @@ def status(
 def store_facts(store: TileStore) -> dict[str, Any]:
     """A tile store for machines: its state, its tiles, and what was noticed of its sources."""
     condition = store.condition()
+    packed = "scans"  # of each scan of a log, for nobody to read
+    sources = [{k: v for k, v in one.items() if k != packed} for one in store.sources()]
     return {
         "url": store.url,
         "whole": condition.whole,
         "condition": str(condition),
         "settings": asdict(store.settings),
-        "sources": store.sources(),
+        "sources": sources,
         "notes": map_notes(store),
         "tiles": {str(key): asdict(mark) for key, mark in store.marks(POINTS).items()},
     }
