@@ -34,7 +34,7 @@ from tilestream.pipeline.stages.drive_scans import opened as opened_log
 from tilestream.pipeline.stages.factors import Looking
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.report import write_comparison
-from tilestream.report.drives import EVALUATED
+from tilestream.report.drives import EVALUATED, DriveMeasured
 from tilestream.report.segments import check_threshold
 from tilestream.sensor import SENSORS, sensor_of
 from tilestream.settings import (
@@ -130,19 +130,29 @@ def localize(
         )
     measured = drive_measured(drive.log, log, how["scans"], places.spacing, found)
     if as_json:
-        facts = error_facts(found)
         told = {"matcher": registration.told, "drive": measured.plain(), "notes": notes}
-        print_json({**told, **facts})
+        print_json({**told, **error_facts(found)})
     else:
         out.print(error_table(found, registration.told, measured))
         say(f"The tables are in {folder}/errors and {folder}/starts")
-    failed = found[found["status"] != "done"]
+    _require_measured(found, measured)
+
+
+def _require_measured(labels: pd.DataFrame, drive: DriveMeasured) -> None:
+    """Fail where a scan of a drive could not be measured, or too little of the drive was.
+
+    Raises:
+        PartialError: some scans failed; lists them.
+        LimitError: less than `EVALUATED` of what was selected was evaluated.
+    """
+    failed = labels[labels["status"] != "done"]
     if len(failed):
         reasons = {f"scan {s}": r for s, r in zip(failed["scan"], failed["reason"], strict=True)}
-        raise PartialError(f"{drive.log}: {len(failed)} of {len(found)} scans failed:", reasons)
-    if not measured.evaluated:
+        told = f"{drive.drive}: {len(failed)} of {len(labels)} scans failed:"
+        raise PartialError(told, reasons)
+    if not drive.evaluated:
         raise LimitError(
-            f"{drive.log}: {measured}: less than {EVALUATED:.0%} of what was selected was "
+            f"{drive.drive}: {drive}: less than {EVALUATED:.0%} of what was selected was "
             "evaluated; --from-s and --until-s select a part that has poses"
         )
 
