@@ -114,6 +114,7 @@ def _run(settings: RunSettings, client: Any | None, watch: Watch | None) -> None
     """The whole job, of the one process that may write the run directory."""
     book = _begin(settings)
     with book.closed():
+        book.write("running")  # in here: who reads it may stop the job at once
         with report_kept(client, settings.folder.under("dask-performance.html").address):
             inputs = inputs_of(settings, client, watch)
             book.failures |= inputs.failures
@@ -161,9 +162,7 @@ def _begin(settings: RunSettings) -> Book:
     """The run directory with the effective settings."""
     text = yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
     write_text(settings.folder.under("config.yaml"), text)
-    book = Book(settings.folder, told_before(settings.folder.under(RECORD)))
-    book.write("running")
-    return book
+    return Book(settings.folder, told_before(settings.folder.under(RECORD)))
 
 
 class _Story:
