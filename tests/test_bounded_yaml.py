@@ -81,3 +81,9 @@ def test_a_value_of_the_command_line_is_bounded_too(tmp_path: Path) -> None:
     for value in ("9" * 5000, "2001-99-99", "[", "&a [*a]"):
         with pytest.raises(UsageError, match="spacing"):
             read_settings(path, [f"spacing={value}"])
+
+
+def test_a_job_with_a_key_twice_is_refused(cases: Path) -> None:
+    job = cases / "job" / "duplicate_key.yaml"
+    with pytest.raises(UsageError, match=r"line 5: 'routes' is there twice"):
+        read_settings(job)
