@@ -197,7 +197,7 @@ def test_a_traceback_only_with_debug(tmp_path: Path, capsys: Told) -> None:
 def test_an_interrupt_is_told_in_one_line(
     pcd: Path, monkeypatch: pytest.MonkeyPatch, capsys: Told
 ) -> None:
-    def interrupted(_: str) -> None:
+    def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("tilestream.apps.info.info", interrupted)
@@ -264,7 +264,7 @@ app.main()
 def test_a_full_disk_is_told_in_one_line(
     pcd: Path, monkeypatch: pytest.MonkeyPatch, capsys: Told
 ) -> None:
-    def full(_: str) -> None:
+    def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("tilestream.apps.info.info", full)

@@ -196,7 +196,7 @@ def test_a_run_directory(job: RunSettings, capsys: Told) -> None:
     assert (low[0], high[0]) == (5.0, 35.0)
     assert found["heights"] == pytest.approx([2.0, 2.0], abs=0.1)
     assert "table factors: 7 rows" in " ".join(found["contents"])
-    record = job.folder / "run.json"
+    record = Path(job.out) / "run.json"
     text = record.read_text()
     record.write_text(text.replace('"done"', '"none"'))
     try:

@@ -406,7 +406,7 @@ def test_a_job_takes_the_folder(
     )
     ts.run(settings)
     record = json.loads((tmp_path / "run" / "run.json").read_text())
-    assert any("without effect here" in note for note in record["notes"])
+    assert any("without effect here" in note for note in record["notes"]["matcher"])
     report = json.loads((tmp_path / "run" / "report" / "report.json").read_text())
     matcher = report["facts"]["matcher"]
     assert (matcher["scan_leaf"], matcher["random_sample"]) == (1.5, 700)

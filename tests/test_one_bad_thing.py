@@ -82,7 +82,7 @@ def test_a_plan_lists_what_would_be_left_out(
         model={"recipe": "physics"},
     )
     notes = forecast(settings).notes
-    assert sum("gone.pcd is left out: " in note for note in notes) == 1
+    assert sum("gone.pcd is left out: " in note for note in notes["plan"]) == 1
 
 
 def test_a_source_of_many_names_is_read_once_and_that_is_said(
@@ -248,7 +248,7 @@ def test_a_drive_of_two_names_is_measured_once(
     read = inputs_of(settings, None, None)
     assert [drive.group for drive in read.drives] == ["canyon", "short"]
     assert [route.route_id for route in read.routes] == ["canyon"]
-    assert sum("is drive canyon again" in note for note in read.notes) == 2
+    assert sum("is drive canyon again" in note for note in read.notes["job"]) == 2
 
 
 def test_a_drive_that_moved_is_not_measured_again(inputs: Path, tmp_path: Path) -> None:
@@ -289,7 +289,7 @@ def test_a_route_given_twice_is_evaluated_once(
     assert command(["factors", store.url, *twice, *out]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["sample_points"] == 5
-    assert any("read once" in note for note in told["notes"])
+    assert "read once" in str(told["notes"])
 
 
 def test_a_project_that_moved_has_nothing_to_do_again(inputs: Path, tmp_path: Path) -> None:

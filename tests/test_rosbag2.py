@@ -89,8 +89,9 @@ def test_a_bag_is_a_source_of_a_map_a_drive_and_a_route(bag: Path, tmp_path: Pat
     store = ts.ingest(tmp_path / "b*", tmp_path / "map.zarr", scans=ts.ScanSelection(every=2))
     (source,) = store.sources()
     assert (source["path"], source["reason"], source["points"]) == (str(bag), "", 6 * 200)
-    errors = ts.localize(store, bag, tmp_path / "out", spacing=3.0)
-    assert errors["scan"].tolist() == [0, 4, 9, 11]
+    others = ts.ScanSelection(every=2, offset=1)
+    errors = ts.localize(store, bag, tmp_path / "out", spacing=3.0, scans=others)
+    assert errors["scan"].tolist() == [1, 5, 9]
     route = read_route(bag)
     assert route.route_id == "bag"
     np.testing.assert_allclose(route.positions[0, :2], (pose(x=20.0, y=5.0) @ MOUNT)[:2, 3])
