@@ -8,7 +8,7 @@ from packaging.version import Version
 
 TESTS = Path(__file__).parent
 PROJECT = tomllib.loads((TESTS.parent / "pyproject.toml").read_text())["project"]
-EXTRAS = ("e57", "s3", "test")
+EXTRAS = ("e57", "ros", "s3", "test")
 READERS = ("mypy", "ruff", "pandas-stubs", "scipy-stubs", "types-PyYAML")
 """Tools that read the code and do not run it."""
 
