@@ -261,7 +261,8 @@ def compare(
     opened = open_store(store)
     with routes_of(route, places.project_to, places.spacing, opened, log) as (read, notes):
         routes = read.routes
-        registration, height = labels.registration, places.sensor_height
+        registration = labels.registration
+        notes = noticed(notes, {MATCHER: registration.notes})
         say_notes({MATCHER: registration.notes})
         own = None if was_given(context, "cell_size") else registration.resolution
         choices = comparing.choices_of(
@@ -304,8 +305,7 @@ def compare(
                 partial=which_map.partial,
             )
         first = found.rows[found.rows["choice"] == found.rows["choice"].iloc[0]]
-        told = noticed(notes, {MATCHER: registration.notes}, _heights_told(first, places))
-        found = replace(found, notes=told)
+        found = replace(found, notes=noticed(notes, _heights_told(first, places)))
         content = write_comparison(found, folder, threshold=report.threshold, cap=cap)
         _show_comparison(content, store, folder, as_json)
 
