@@ -19,6 +19,7 @@ FLOORS = (
     ("settings",),
     ("ndt", "preprocessing"),
     ("store", "tables", "formats", "simulation"),
+    ("local_map",),
     ("registration",),
     ("label",),
     ("factors", "model"),

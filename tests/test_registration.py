@@ -15,6 +15,7 @@ from scenes import UTM, rotated_scene, scene
 from tilestream.errors import RegistrationError, UsageError
 from tilestream.kernels.newton import definite_step, raw_step
 from tilestream.label import start_poses
+from tilestream.local_map import LocalCells
 from tilestream.ndt import cells_of
 from tilestream.records import Cells, Registrations
 from tilestream.registration import register
@@ -249,6 +250,36 @@ def test_cells_far_away_change_no_bit(mode: str, cells: Cells, scan: Floats) -> 
     assert same_bits(
         register(far, scan, starts, MODES[mode]), register(cells, scan, starts, MODES[mode])
     )
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_scans_that_share_their_listed_cells_end_where_they_end_alone(
+    mode: str, cells: Cells, scan: Floats
+) -> None:
+    places = [T_MAP_LIDAR, pose(4.0, 1.0, 1.9), pose(16.0, 0.5, 1.8, (0, 0, -0.2))]
+    reach = np.linalg.norm(scan, axis=1).max() + 10.0
+    shared = LocalCells.around(cells, np.array([T[:3, 3] for T in places]), reach, MODES[mode])
+    for k, T in enumerate(places):
+        some, starts = scan[k::2], starts_around(T, 6, seed=k)
+        for how in (MODES[mode], MODES[mode].model_copy(update=SCORE_ONLY)):
+            assert same_bits(
+                register(shared, some, starts, how), register(cells, some, starts, how)
+            )
+
+
+def test_listed_cells_refuse_what_they_are_not_for(cells: Cells, scan: Floats) -> None:
+    shared = LocalCells.around(cells, T_MAP_LIDAR[None, :3, 3], 120.0, MODES["direct7"])
+    with pytest.raises(UsageError, match="another matcher: neighbours"):
+        register(shared, scan, T_MAP_LIDAR, MODES["radius"])
+    with pytest.raises(UsageError, match="beyond"):
+        register(shared, scan, pose(150.0, 0, 0), MODES["direct7"])
+    with pytest.raises(RegistrationError, match="no cells within"):
+        LocalCells.around(cells, np.array([[10_000.0, 0.0, 0.0]]), 50.0, MODES["direct7"])
+    wide = LocalCells.around(
+        cells, np.array([[0.0, 0.0, 0.0], [10_000.0, 0.0, 0.0]]), 200.0, MODES["direct7"]
+    )
+    with pytest.raises(RegistrationError, match="no cells within"):
+        register(wide, scan, pose(10_000.0, 0, 0), MODES["direct7"])
 
 
 @pytest.mark.parametrize("mode", ["direct1", "direct7", "autoware"])
