@@ -9,7 +9,7 @@ from scenes import PLACES
 
 import tilestream as ts
 from tilestream.factors.surfels import surfel_mm, surfels_in
-from tilestream.factors.virtual_scan import Beams, Scene, virtual_scan
+from tilestream.factors.virtual_scan import Beams, Scene, look, virtual_scan
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.grid import Box
 from tilestream.settings import VirtualSettings
@@ -32,7 +32,8 @@ def figures(folder: Path) -> dict[str, NDArray[np.float64]]:
         place_mm = np.rint(place * 1000.0).astype(np.int64)
         scene = Scene.of(surfels, place_mm[None], surfel_mm(store))
         beams = Beams.of(ts.VLP16, seeing)
-        scan = virtual_scan(scene, place_mm, 0.0, seeing, beams).points
+        found = look(scene, place_mm, 0.0, seeing, beams)
+        scan = virtual_scan(scene, found, place_mm, seeing, beams).points
         still = ts.RegistrationSettings(iterations_max=0)
         hessian.append(ts.register(cells, scan, T_map_lidar, still).hessian[0])
         error.append(ts.localization_error(cells, scan, T_map_lidar).error)

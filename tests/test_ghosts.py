@@ -12,17 +12,14 @@ from tilestream.factors.ghosts import (
     LOW_MM,
     OPEN,
     REACH_EDGES,
+    SLIM,
+    UPRIGHT,
     ghosts_among,
 )
-from tilestream.factors.surfels import Surfels
 
 EDGE = 200
 Mask = np.ndarray
-
-
-def balls(centre_mm: np.ndarray) -> Surfels:
-    n = len(centre_mm)
-    return Surfels(centre_mm, np.zeros((n, 3), np.int16), np.full(n, 100, np.int32))
+STEPS = range(-AROUND, AROUND + 1)
 
 
 def box(low: tuple[int, int, int], high: tuple[int, int, int]) -> np.ndarray:
@@ -31,7 +28,7 @@ def box(low: tuple[int, int, int], high: tuple[int, int, int]) -> np.ndarray:
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3) * EDGE + EDGE // 2
 
 
-def street() -> tuple[Surfels, dict[str, Mask]]:
+def street() -> tuple[np.ndarray, dict[str, Mask]]:
     """Ground of 40 m x 12 m, and on it a car that passed, one that stayed, a tree, a facade."""
     ground = box((0, 0, 0), (200, 60, 1))
     under = (np.abs(ground[:, :2] - (20_000, 6_000)) < (2_300, 900)).all(axis=1)
@@ -42,26 +39,29 @@ def street() -> tuple[Surfels, dict[str, Mask]]:
         "crown": box((140, 20, 18), (160, 40, 25)),
         "trunk": box((149, 29, 1), (151, 31, 18)),
         "facade": box((0, 59, 1), (200, 60, 50)),
+        "post": box((70, 10, 1), (71, 11, 12)),
+        "stub": box((80, 10, 1), (81, 11, 5)),
     }
     of = np.repeat(list(parts), [len(part) for part in parts.values()])
-    return balls(np.concatenate(list(parts.values()))), {name: of == name for name in parts}
+    return np.concatenate(list(parts.values())), {name: of == name for name in parts}
 
 
 def test_what_passed_is_a_ghost_and_what_stands_is_not() -> None:
-    surfels, of = street()
-    ghost = ghosts_among(surfels, EDGE)
-    height = surfels.centre_mm[:, 2] - EDGE // 2
+    centres, of = street()
+    ghost = ghosts_among(centres, EDGE)
+    height = centres[:, 2] - EDGE // 2
     assert ghost[of["passed"] & (height > LOW_MM)].all()
     assert (of["passed"] & ghost).sum() > 500
-    for name in ("ground", "parked", "crown", "trunk", "facade"):
+    assert ghost[of["stub"] & (height > LOW_MM)].all()
+    for name in ("ground", "parked", "crown", "trunk", "facade", "post"):
         assert not ghost[of[name]].any(), name
 
 
 @pytest.mark.parametrize("shift", [(0, 0, 137), (-33_000, 12_000, -5_001), (3 * 10**8, 10**9, 0)])
 def test_whole_metres_of_translation_do_not_show(shift: tuple[int, int, int]) -> None:
-    surfels, _ = street()
-    moved = balls(surfels.centre_mm + np.array(shift))
-    np.testing.assert_array_equal(ghosts_among(moved, EDGE), ghosts_among(surfels, EDGE))
+    centres, _ = street()
+    moved = centres + np.array(shift)
+    np.testing.assert_array_equal(ghosts_among(moved, EDGE), ghosts_among(centres, EDGE))
 
 
 def literal(centre_mm: np.ndarray) -> Mask:
@@ -79,12 +79,21 @@ def literal(centre_mm: np.ndarray) -> Mask:
             low = centre_mm[near, 2].min()
             return bool(here.min() <= low + LOW_MM and here.max() <= low + HIGH_MM)
 
+        def stands(at: np.ndarray) -> int:
+            """How much of a column is above the ground and open."""
+            here = centre_mm[(column == at).all(axis=1), 2]
+            near = (np.abs(block - at // BLOCK) <= 1).all(axis=1)
+            around = [shows(at + np.array((i, j))) for i in STEPS for j in STEPS]
+            if not shows(at) or sum(around) < OPEN * len(around):
+                return 0
+            height = here - centre_mm[near, 2].min()
+            return int(((height > LOW_MM) & (height <= HIGH_MM)).sum())
+
         near = (np.abs(block - block[row]) <= 1).all(axis=1)
         height = z - centre_mm[near, 2].min()
-        if LOW_MM < height <= HIGH_MM and shows(column[row]):
-            steps = range(-AROUND, AROUND + 1)
-            around = [shows(column[row] + (i, j)) for i in steps for j in steps]
-            found[row] = sum(around) >= OPEN * len(around)
+        if LOW_MM < height <= HIGH_MM and stands(column[row]):
+            around = [stands(column[row] + np.array((i, j))) > 0 for i in STEPS for j in STEPS]
+            found[row] = stands(column[row]) < UPRIGHT or sum(around) > SLIM
     return found
 
 
@@ -95,19 +104,20 @@ def test_the_ghosts_are_those_of_the_literal_reference(seed: int) -> None:
     ground = box((-9, -6, 0), (8, 7, 1))
     kept = ground[rng.uniform(size=len(ground)) < 0.9]
     above = rng.integers((-1800, -1200, 0), (1600, 1400, 4500), (25, 3))
-    surfels = balls(np.concatenate([kept, above]))
-    np.testing.assert_array_equal(ghosts_among(surfels, EDGE), literal(surfels.centre_mm))
+    post = np.array([[300, 300, 300 + 200 * k] for k in range(rng.integers(3, 14))])
+    centres = np.concatenate([kept, above, post])
+    np.testing.assert_array_equal(ghosts_among(centres, EDGE), literal(centres))
 
 
 def test_nothing_beyond_the_reach_shows() -> None:
-    surfels, _ = street()
-    x = surfels.centre_mm[:, 0]
+    centres, _ = street()
+    x = centres[:, 0]
     middle = (x > 8_000) & (x < 14_000)
     margin = REACH_EDGES * EDGE
     crop = (x > 8_000 - margin) & (x < 14_000 + margin)
-    everywhere = ghosts_among(surfels, EDGE)
-    cut = np.zeros(len(surfels), np.bool_)
-    cut[crop] = ghosts_among(surfels.where(crop), EDGE)
+    everywhere = ghosts_among(centres, EDGE)
+    cut = np.zeros(len(centres), np.bool_)
+    cut[crop] = ghosts_among(centres[crop], EDGE)
     assert everywhere[middle].any()
     np.testing.assert_array_equal(cut[middle], everywhere[middle])
-    assert len(ghosts_among(surfels.where(np.zeros(len(surfels), np.bool_)), EDGE)) == 0
+    assert len(ghosts_among(centres[:0], EDGE)) == 0

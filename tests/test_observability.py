@@ -1,6 +1,7 @@
 """Observability and the virtual drive: closed forms, invariances, any tiling, bad places named."""
 
 import math
+from itertools import combinations_with_replacement, product
 from pathlib import Path
 
 import numpy as np
@@ -18,16 +19,23 @@ from tilestream.factors.observability import (
     information,
     observability,
 )
-from tilestream.factors.surfels import Surfels, in_view, surfels_in
+from tilestream.factors.surfels import in_view, surfels_in
 from tilestream.factors.virtual_drive import (
     AVERAGED,
+    AXES,
+    MOMENT_COLUMNS,
+    RINGS,
+    SPREAD_COLUMNS,
+    Ends,
     averaged_along,
+    drive,
     physics,
     physics_offset,
     stratified_starts,
     virtual_drive,
     weighted_median,
 )
+from tilestream.factors.virtual_drive import COLUMNS as VIRTUAL
 from tilestream.factors.virtual_scan import Beams, Scene, cast
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.grid import Box
@@ -135,7 +143,7 @@ def test_a_tunnel_holds_across_and_not_along(tunnel: ts.TileStore) -> None:
     assert row["status"] == "done", row["reason"]
     assert row["ob_info_along"] < 0.2 * row["ob_info_across"]
     assert row["ob_weak_angle"] < math.radians(10.0)
-    assert row["vd_along"] > 2.0 * row["vd_across"]
+    assert row["vd_along"] > 1.5 * row["vd_across"]
     other_way = look(tunnel, [[20.0, 0.2, 2.0]], [math.pi / 2]).iloc[0]
     assert other_way["ob_info_across"] < 0.2 * other_way["ob_info_along"]
     assert other_way["ob_weak_angle"] > math.radians(80.0)
@@ -145,21 +153,24 @@ def test_a_tunnel_holds_across_and_not_along(tunnel: ts.TileStore) -> None:
 
 
 def test_the_starts_stand_for_the_whole_disc() -> None:
-    whole, even = stratified_starts(None)
-    assert len(whole) == 317
-    np.testing.assert_allclose(even, 1.0 / 317)
-    known = {tuple(start) for start in whole.tolist()}
-    for count in (16, 32, 64):
-        starts, weight = stratified_starts(count)
-        radius = np.hypot(*starts.T)
-        assert len(starts) == count
-        assert len({tuple(start) for start in starts.tolist()} & known) == count
-        assert weight.sum() == pytest.approx(1.0)
-        assert weight @ radius == pytest.approx(np.hypot(*whole.T).mean(), abs=0.05)
-        assert np.abs(weight @ starts).max() < 0.1
-    radius = np.hypot(*stratified_starts(32)[0].T)
-    rings = [(radius <= 1.0 + 1e-9).sum(), ((radius > 1.0 + 1e-9) & (radius <= 1.5)).sum()]
-    assert rings == [4, 8]
+    whole = stratified_starts(None)
+    assert len(whole.offset) == 317
+    np.testing.assert_allclose(whole.weight, 1.0 / 317)
+    known = {tuple(start) for start in whole.offset.tolist()}
+    for count, draw in product((16, 32, 64), (0, 1, 4)):
+        starts = stratified_starts(count, draw)
+        radius = np.hypot(*starts.offset.T)
+        assert len(starts.offset) == count
+        assert len({tuple(start) for start in starts.offset.tolist()} & known) == count
+        assert starts.weight.sum() == pytest.approx(1.0)
+        mean = np.hypot(*whole.offset.T).mean()
+        assert starts.weight @ radius == pytest.approx(mean, abs=0.05)
+        assert np.abs(starts.weight @ starts.offset).max() < 0.1
+        inside = [radius <= 1.0 + 1e-9, radius <= 1.5 + 1e-9]
+        np.testing.assert_array_equal(starts.ring, 2 - inside[0].astype(int) - inside[1])
+    assert np.bincount(stratified_starts(32).ring).tolist() == [8, 8, 16]
+    several = [{tuple(s) for s in stratified_starts(32, k).offset.tolist()} for k in range(5)]
+    assert len(set.union(*several)) > 100
 
 
 def test_with_all_starts_it_is_the_label_of_the_virtual_scan(store: ts.TileStore) -> None:
@@ -168,7 +179,7 @@ def test_with_all_starts_it_is_the_label_of_the_virtual_scan(store: ts.TileStore
     T = np.eye(4)
     T[:3, 3] = PLACE
     settings = ts.RegistrationSettings.autoware()
-    found = virtual_drive(cells, points, T, settings, stratified_starts(None))
+    found = virtual_drive([drive(cells, points, T, settings, stratified_starts(None))])
     label = localization_error(cells, points, T, settings=settings)
     for name, expected in (
         ("vd_mean", label.error_mean),
@@ -182,6 +193,43 @@ def test_with_all_starts_it_is_the_label_of_the_virtual_scan(store: ts.TileStore
         assert found[name] == pytest.approx(expected, abs=1e-12), name
     held = np.sort(label.error[label.error <= 0.5])
     assert held[(len(held) - 1) // 2] <= found["vd_median"] <= held[len(held) // 2]
+    near = np.hypot(*(label.T_map_lidar_starts[:, :2, 3] - T[:2, 3]).T) <= 1.0 + 1e-9
+    assert found["vd_near_across"] == pytest.approx(label.across[near].mean(), abs=1e-12)
+    product_of = (label.along * label.up)[near].mean()
+    assert found["vd_near_along_up"] == pytest.approx(product_of, abs=1e-12)
+
+
+def ends(seed: int, count: int = 32) -> Ends:
+    """A draw whose registrations end anywhere."""
+    axes = np.random.default_rng(seed).normal(0.0, 0.2, (count, 6))
+    return Ends(stratified_starts(count, seed), np.linalg.norm(axes[:, :3], axis=1), axes)
+
+
+def test_a_place_is_the_mean_of_its_draws_and_tells_their_spread() -> None:
+    draws = [ends(k) for k in range(4)]
+    found, alone = virtual_drive(draws), [virtual_drive([one]) for one in draws]
+    for name in AVERAGED:
+        each = np.array([one[name] for one in alone])
+        assert found[name] == pytest.approx(each.mean())
+        assert found[f"{name}_sd"] == pytest.approx(each.std(ddof=1))
+        assert all(math.isnan(one[f"{name}_sd"]) for one in alone)
+    assert found["vd_draws"] == 4.0
+    assert set(found) == {column.name for column in VIRTUAL}
+
+
+def test_the_moments_are_those_of_all_starts_of_a_ring() -> None:
+    draws = [ends(k) for k in range(3)]
+    found = virtual_drive(draws)
+    axes = np.vstack([one.axes for one in draws])
+    ring = np.concatenate([one.starts.ring for one in draws])
+    for number, name in enumerate(RINGS):
+        mean = np.array([found[f"vd_{name}_{axis}"] for axis in AXES])
+        np.testing.assert_allclose(mean, axes[ring == number].mean(axis=0))
+        second = np.zeros((6, 6))
+        for (i, a), (j, b) in combinations_with_replacement(enumerate(AXES), 2):
+            second[i, j] = second[j, i] = found[f"vd_{name}_{a}_{b}"]
+        covariance = second - np.outer(mean, mean)
+        np.testing.assert_allclose(covariance, np.cov(axes[ring == number].T, ddof=0), atol=1e-12)
 
 
 def test_a_weighted_median_has_half_of_the_weight_on_each_side() -> None:
@@ -265,7 +313,10 @@ def test_every_column_is_there_and_documented(store: ts.TileStore) -> None:
     assert table.columns.tolist() == [c.name for c in COLUMNS] + ["status", "reason"]
     assert table["status"].tolist() == ["done"]
     assert table[[c.name for c in COLUMNS]].notna().all(axis=None)
-    assert all(c.criterion == "OB" and c.factor_set == "observability" for c in COLUMNS)
+    assert all(c.factor_set == "observability" for c in COLUMNS)
+    assert {c.name for c in COLUMNS if c.criterion != "OB"} == {
+        c.name for c in (*SPREAD_COLUMNS, *MOMENT_COLUMNS)
+    } | {"vd_draws"}
     assert all(c.unit and c.meaning and c.source for c in COLUMNS)
 
 
@@ -296,7 +347,7 @@ def test_a_wider_crop_of_the_map_shows_nothing_more(store: ts.TileStore) -> None
         cast(scene.bricks, place_mm, beams.direction, 0.0, 15_000.0, ranges, cosine)
         found.append(ranges)
     np.testing.assert_array_equal(*found)
-    nothing = Surfels(np.zeros((0, 3), np.int64), np.zeros((0, 3), np.int16), np.zeros(0, np.int32))
+    nothing = everything.where(np.zeros(len(everything), np.bool_))
     assert len(in_view(nothing, place, SENSOR.fov_deg, 15.0)) == 0
 
 

@@ -13,7 +13,7 @@ from test_virtual_scan import CLEAN, FEW, scene_of, sheet
 import tilestream as ts
 from tilestream.errors import UsageError
 from tilestream.factors.observability import observability
-from tilestream.factors.virtual_scan import Beams, VirtualScan, virtual_scan
+from tilestream.factors.virtual_scan import Beams, VirtualScan, look, virtual_scan
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.marks import hash_of
 from tilestream.sensor import Carrier, Mount, Sensor, Vehicle, in_blind_sector, sensor_of
@@ -33,7 +33,9 @@ def mounted(sensor: Sensor = EXACT, **mount: float) -> Sensor:
 
 def scan_of(points: Floats, vehicle: Carrier, place_mm: Floats, heading: float) -> VirtualScan:
     beams = Beams.of(vehicle, CERTAIN)
-    return virtual_scan(scene_of(points, place_mm, beams.rim), place_mm, heading, CERTAIN, beams)
+    scene = scene_of(points, place_mm, beams.rim)
+    found = look(scene, place_mm, heading, CERTAIN, beams)
+    return virtual_scan(scene, found, place_mm, CERTAIN, beams)
 
 
 @pytest.fixture(scope="module")

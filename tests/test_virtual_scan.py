@@ -21,12 +21,12 @@ from tilestream.factors.virtual_scan import (
     Beams,
     Scene,
     VirtualScan,
-    draws,
-    first_returns,
+    look,
     near_share,
     probability,
     virtual_scan,
 )
+from tilestream.factors.worlds import Dice
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.grid import Box
 from tilestream.kernels.cells import cell_sums
@@ -53,7 +53,8 @@ def surfels_from(points: Floats) -> Surfels:
     """The surfels of points [m]."""
     index, sums = cell_sums(np.rint(points * 1000).astype(np.int64), EDGE)
     own = np.ones(len(index), np.bool_)
-    return Surfels(*surfels_of(thin(index, sums, EDGE), index, EDGE, own))
+    made = surfels_of(thin(index, sums, EDGE), index, EDGE, own)
+    return Surfels(*made, np.zeros(len(index), np.bool_))
 
 
 def scene_of(points: Floats, place_mm: Floats, rim: float = 0.0) -> Scene:
@@ -68,7 +69,8 @@ def scan_at(
     """What `FEW` sees in points [m] from a place."""
     place_mm, beams = np.rint(np.array(place) * 1000).astype(np.int64), Beams.of(FEW, seeing)
     scene = scene_of(points, place_mm)
-    return virtual_scan(scene, place_mm, heading, seeing, beams), beams
+    found = look(scene, place_mm, heading, seeing, beams)
+    return virtual_scan(scene, found, place_mm, seeing, beams), beams
 
 
 def sheet(rng: np.random.Generator, length: float, width: float, spacing: float = 0.2) -> Floats:
@@ -214,6 +216,7 @@ def test_the_marching_is_that_of_the_literal_reference(seed: int) -> None:
         rng.integers(-3000, 3000, (60, 3)),
         np.rint(directions(rng, 60) * NORMAL_ONE).astype(np.int16),
         rng.integers(60, 200, 60).astype(np.int32),
+        np.zeros(60, np.bool_),
     )
     surfels.normal[::4] = 0
     place = rng.integers(-1500, 1500, 3)
@@ -248,9 +251,9 @@ def test_whole_voxels_of_translation_do_not_show(street: Floats) -> None:
         beams = Beams.of(FEW, CLEAN)
         place_mm = np.rint((place + shift) * 1000).astype(np.int64)
         scene = Scene.of(surfels_from(street + shift), place_mm[None], EDGE)
-        ranges, cosine, _ = first_returns(scene, place_mm, 0.3, CLEAN, beams)
-        np.testing.assert_array_equal(ranges, here.ranges)
-        np.testing.assert_array_equal(cosine, here.cosine)
+        (met,) = look(scene, place_mm, 0.3, CLEAN, beams)
+        np.testing.assert_array_equal(met.ranges, here.ranges)
+        np.testing.assert_array_equal(met.cosine, here.cosine)
 
 
 def test_a_quarter_turn_of_map_and_vehicle_does_not_show(street: Floats) -> None:
@@ -273,7 +276,9 @@ def cloud(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def everything(store: ts.TileStore) -> Surfels:
     found = surfels_in(store, Box(-100_000, -100_000, 100_000, 100_000))
     order = np.lexsort(np.column_stack([found.normal, found.centre_mm]).T)
-    return Surfels(found.centre_mm[order], found.normal[order], found.radius_mm[order])
+    return Surfels(
+        found.centre_mm[order], found.normal[order], found.radius_mm[order], found.ghost[order]
+    )
 
 
 def test_no_tiling_shows_in_the_surfels(cloud: Path, tmp_path: Path) -> None:
@@ -288,6 +293,7 @@ def test_no_tiling_shows_in_the_surfels(cloud: Path, tmp_path: Path) -> None:
         np.testing.assert_array_equal(one.centre_mm, other.centre_mm)
         np.testing.assert_array_equal(one.normal, other.normal)
         np.testing.assert_array_equal(one.radius_mm, other.radius_mm)
+        np.testing.assert_array_equal(one.ghost, other.ghost)
 
 
 def test_a_table_of_surfels_is_used_while_it_is_up_to_date(cloud: Path, tmp_path: Path) -> None:
@@ -377,14 +383,24 @@ def test_the_place_and_nothing_else_decides_noise_and_drop_outs(street: Floats) 
     assert one.return_share == one.came.mean()
 
 
-def test_draws_are_uniform_and_differ_from_place_to_place() -> None:
-    numbers = draws(np.array([1, -2, 3]), 0, 5000, 2)
-    assert ((numbers > 0.0) & (numbers < 1.0)).all()
-    np.testing.assert_allclose(numbers.mean(axis=1), 0.5, atol=0.02)
-    np.testing.assert_allclose(numbers.std(axis=1), 12**-0.5, atol=0.01)
-    assert abs(np.corrcoef(numbers)[0, 1]) < 0.05
-    for other in ([1, -2, 4], [-2, 1, 3], [0, -2, 3]):
-        assert (draws(np.array(other), 0, 5000, 2) != numbers).mean() > 0.99
+def test_dice_are_uniform_and_differ_from_place_to_place_and_draw_to_draw() -> None:
+    def numbers(place: list[int], seed: int = 0, draw: int = 0) -> Floats:
+        dice = Dice(np.array(place), seed, draw)
+        return np.array([dice.uniform(5000), dice.uniform(5000)])
+
+    found = numbers([1, -2, 3])
+    assert ((found > 0.0) & (found < 1.0)).all()
+    np.testing.assert_allclose(found.mean(axis=1), 0.5, atol=0.02)
+    np.testing.assert_allclose(found.std(axis=1), 12**-0.5, atol=0.01)
+    assert abs(np.corrcoef(found)[0, 1]) < 0.05
+    np.testing.assert_array_equal(found, numbers([1, -2, 3]))
+    others = [numbers(place) for place in ([1, -2, 4], [-2, 1, 3], [0, -2, 3])]
+    for other in (*others, numbers([1, -2, 3], seed=1), numbers([1, -2, 3], draw=1)):
+        assert (other != found).mean() > 0.99
+        assert abs(np.corrcoef(other[0], found[0])[0, 1]) < 0.05
+    normal = Dice(np.array([1, -2, 3]), 0, 0).normal(2.0, 20_000)
+    assert abs(normal.mean()) < 0.05
+    assert normal.std() == pytest.approx(2.0, abs=0.05)
 
 
 def test_returns_fade_with_range_and_grazing_incidence() -> None:

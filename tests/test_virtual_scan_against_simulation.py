@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import tilestream as ts
-from tilestream.factors.ghosts import ghosts_among
 from tilestream.factors.observability import whole_places
 from tilestream.factors.surfels import surfel_mm, surfels_in
 from tilestream.factors.virtual_scan import Scene
@@ -35,7 +34,7 @@ def test_most_beams_end_where_those_of_the_simulator_did(tmp_path: Path) -> None
         assert scan.T_map_lidar is not None
         place = scan.T_map_lidar[:3, 3]
         surfels = surfels_in(store, Box.around(place[None], REACH / 1e3))
-        seen = surfels.where(~ghosts_among(surfels, surfel_mm(store)))
+        seen = surfels.where(~surfels.ghost)
         scene = Scene.of(seen, whole_places(place)[None], surfel_mm(store))
         true = np.linalg.norm(scan.points, axis=1)
         beams = np.ascontiguousarray(scan.points / true[:, None] @ scan.T_map_lidar[:3, :3].T)

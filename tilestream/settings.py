@@ -238,10 +238,21 @@ class VirtualSettings(Settings):
     without_ghosts: bool = True
     """Whether traffic that the survey recorded is left out of the scan (ghosts); some thin objects
     such as posts are left out with it."""
-    starts: Annotated[int, Field(ge=8)] | None = 64
-    """Starts of the virtual drive, spread over the disc of starts; null: all of them."""
+    draws: Annotated[int, Field(ge=1, le=100)] = 5
+    """Scans of the virtual drive at a place, each with other noise and other starts …"""
+    worlds: Annotated[int, Field(ge=0)] = 2
+    """… of which so many are taken in streets that are not as they were mapped: other cars, people,
+    leaves gone, motion, bias, returns lost."""
+    starts: Annotated[int, Field(ge=8)] | None = 32
+    """Starts of each of them, spread over the disc of starts; null: all of them."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
-    """Seed of noise and drop-outs; the place is part of it too."""
+    """Seed of noise, drop-outs and streets; the place is part of it too."""
+
+    @model_validator(mode="after")
+    def _check_worlds(self) -> Self:
+        if self.worlds > self.draws:
+            raise ValueError(f"worlds {self.worlds}: give no more than draws, {self.draws}")
+        return self
 
 
 class LabelSettings(Settings):

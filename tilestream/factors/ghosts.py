@@ -2,14 +2,11 @@
 
 A parked car hides the ground beneath it in every pass of the survey. A moving car does not: the map
 has the ground there too. So what stands above mapped ground, with mapped ground around it, is a
-ghost. Thin objects with ground all around, such as lamp posts or fences, may be classified as
-ghosts too.
+ghost; unless it is upright and slim, as lamp posts and signs are.
 """
 
 import numpy as np
 from numpy.typing import NDArray
-
-from tilestream.factors.surfels import Surfels
 
 LOW_MM, HIGH_MM = 300, 3_400
 """Heights above the ground between which traffic stands [mm]."""
@@ -19,36 +16,43 @@ AROUND = 2
 """Columns on each side that are checked for ground too: 5 x 5 in all."""
 OPEN = 0.7
 """Least share of these columns that must show ground."""
-REACH_EDGES = 2 * BLOCK + AROUND
-"""How far around a surfel the map is needed to decide whether it is a ghost [edges]: 2.4 m."""
+UPRIGHT = 6
+"""Least surfels of a column that is upright: 1.2 m."""
+SLIM = 4
+"""Most columns of the 5 x 5 around that have something above the ground where it is slim."""
+REACH_EDGES = 2 * BLOCK + 2 * AROUND
+"""How far around a surfel the map is needed to decide whether it is a ghost [edges]: 2.8 m."""
 NONE_MM = 2**30
 """Height of a column without surfels: above all ground [mm]."""
 
 Int32 = NDArray[np.int32]
+Int64 = NDArray[np.int64]
 
 
-def ghosts_among(surfels: Surfels, edge_mm: int) -> NDArray[np.bool_]:
+def ghosts_among(centre_mm: Int64, edge_mm: int) -> NDArray[np.bool_]:
     """Which surfels are ghosts.
 
     A ghost stands 0.3 to 3.4 m above the ground, the lowest surfel of the blocks of 1 m around. Its
     own column, of one voxel, and 70 % of the 5 x 5 around it show ground and nothing above 3.4 m.
+    Of these columns, those that are upright and slim are none: 6 surfels or more above the ground,
+    in at most 4 columns of the 5 x 5.
 
     Args:
-        surfels: the surfels of a part of the map; within `REACH_EDGES` of its rim the result may
-            be wrong, since surfels around are missing.
+        centre_mm: (n, 3) centres of the surfels of a part of the map [mm, map frame]; within
+            `REACH_EDGES` of its rim the result may be wrong, since surfels around are missing.
         edge_mm: edge of their voxels [mm].
 
     Returns:
         (n,) True for a ghost.
     """
-    if not len(surfels):
+    if not len(centre_mm):
         return np.zeros(0, np.bool_)
     block_mm = BLOCK * edge_mm
-    corner = surfels.centre_mm[:, :2].min(axis=0) // block_mm * block_mm
-    column = (surfels.centre_mm[:, :2] - corner) // edge_mm
-    shape = (column.max(axis=0) // BLOCK + 1) * BLOCK
+    corner = centre_mm[:, :2].min(axis=0) // block_mm * block_mm
+    column = (centre_mm[:, :2] - corner) // edge_mm
+    shape = tuple((column.max(axis=0) // BLOCK + 1) * BLOCK)
     at = column[:, 0] * shape[1] + column[:, 1]
-    z = (surfels.centre_mm[:, 2] - surfels.centre_mm[:, 2].min()).astype(np.int32)
+    z = (centre_mm[:, 2] - centre_mm[:, 2].min()).astype(np.int32)
     lowest, highest = (np.full(shape, none, np.int32) for none in (NONE_MM, -NONE_MM))
     np.minimum.at(lowest.reshape(-1), at, z)
     np.maximum.at(highest.reshape(-1), at, z)
@@ -56,7 +60,10 @@ def ghosts_among(surfels: Surfels, edge_mm: int) -> NDArray[np.bool_]:
     shows = (lowest < NONE_MM) & (lowest <= ground + LOW_MM) & (highest <= ground + HIGH_MM)
     is_open = shows & (_sum_around(shows) >= OPEN * (2 * AROUND + 1) ** 2)
     height = z - ground.reshape(-1)[at]
-    found: NDArray[np.bool_] = (height > LOW_MM) & (height <= HIGH_MM) & is_open.reshape(-1)[at]
+    stands = (height > LOW_MM) & (height <= HIGH_MM) & is_open.reshape(-1)[at]
+    count = np.bincount(at[stands], minlength=is_open.size).reshape(shape)
+    slim = (count >= UPRIGHT) & (_sum_around(count > 0) <= SLIM)
+    found: NDArray[np.bool_] = stands & ~slim.reshape(-1)[at]
     return found
 
 

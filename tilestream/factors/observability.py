@@ -6,31 +6,33 @@ sample point (`virtual_scan.py`), the NDT Hessian of that scan at the sample poi
 registrations of it end (`virtual_drive.py`).
 """
 
-import itertools
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
 from tilestream.errors import RegistrationError, TileNotReadyError, UsageError
-from tilestream.factors import virtual_drive
-from tilestream.factors.ghosts import REACH_EDGES, ghosts_among
 from tilestream.factors.surfels import Surfels, in_view, surfel_mm, surfels_in
 from tilestream.factors.table import NO_GROUND, places_of
-from tilestream.factors.virtual_drive import stratified_starts
+from tilestream.factors.virtual_drive import COLUMNS as DRIVE_COLUMNS
+from tilestream.factors.virtual_drive import Ends, drive, stratified_starts, virtual_drive
 from tilestream.factors.virtual_scan import (
     Beams,
+    Returns,
     Scene,
     VirtualScan,
-    first_returns,
+    look,
     near_share,
+    scan_in_world,
     virtual_scan,
 )
 from tilestream.formats.logs.poses import transform
 from tilestream.grid import MM_PER_M, Box
 from tilestream.kernels.cells import cell_of_points, cell_sums
+from tilestream.local_map import LocalCells
 from tilestream.matcher import RegistrationSettings
 from tilestream.records import Cells, Column, Float64, Int64
 from tilestream.registration import register
@@ -83,7 +85,7 @@ VIEW_COLUMNS = (
     _column("ob_unmapped", "1", "Share of the beams that meet nothing and leave the mapped area."),
     _column("ob_ghosts", "1", "Share of the beams that traffic in the map would stop, left out."),
 )
-COLUMNS = (*HESSIAN_COLUMNS, *VIEW_COLUMNS, *virtual_drive.COLUMNS)
+COLUMNS = (*HESSIAN_COLUMNS, *VIEW_COLUMNS, *DRIVE_COLUMNS)
 """All columns of the criterion."""
 
 
@@ -156,7 +158,7 @@ class _View:
         self.registration = registration
         self.cell_size = cell_size
         self.beams = Beams.of(sensor, seeing)
-        self.starts = stratified_starts(seeing.starts)
+        self.starts = [stratified_starts(seeing.starts, draw) for draw in range(seeing.draws)]
 
     def rows(self, places: Float64, turns: Float64, some: Int64) -> Iterator[tuple[int, Row]]:
         """The rows of some places, for which the map is read once.
@@ -174,23 +176,43 @@ class _View:
                 yield from self.rows(places, turns, np.array([row]))
             return
         for block in blocks_of(places, some):
-            scene, passed = (self.scene(those, places[block]) for those in (surfels, ghosts))
+            around = self.block(surfels, ghosts, cells, places[block])
             for row in block:
-                yield int(row), self.seen_from(scene, passed, cells, places[row], turns[row])
+                yield int(row), self.seen_from(around, places[row], turns[row])
 
     def around(self, places: Float64) -> tuple[Surfels, Surfels, Cells]:
         """The surfels that can be seen from the places, those of them that are ghosts apart, and
         the cells around.
         """
-        reach, edge_mm = self.beams.range_max + self.beams.rim, surfel_mm(self.store)
-        rim = 1.0 + REACH_EDGES * edge_mm / MM_PER_M
-        surfels = surfels_in(self.store, Box.around(places, reach + rim))
+        reach = self.beams.range_max + self.beams.rim
+        surfels = surfels_in(self.store, Box.around(places, reach + 1.0))
         cells = self.store.cells_in(Box.around(places, reach + MARGIN), self.cell_size)
-        ghost = np.zeros(len(surfels), np.bool_)
-        if self.seeing.without_ghosts:
-            ghost = ghosts_among(surfels, edge_mm)
+        ghost = surfels.ghost & self.seeing.without_ghosts
         real, ghosts = (self.in_view(surfels.where(chosen), places) for chosen in (~ghost, ghost))
         return real, ghosts, cells
+
+    def block(
+        self, surfels: Surfels, ghosts: Surfels, cells: Cells, places: Float64
+    ) -> "_Block | None":
+        """What places near one another share; None: nothing is in view."""
+        scene = self.scene(surfels, places)
+        if scene is None:
+            return None
+        seed, still = self.seeing.seed, self.seeing.draws - self.seeing.worlds
+        return _Block(
+            scene,
+            self.scene(ghosts, places),
+            tuple(scene.without_foliage(seed, k) for k in range(still, self.seeing.draws)),
+            self.listed(cells, places),
+        )
+
+    def listed(self, cells: Cells, places: Float64) -> Cells | LocalCells:
+        """The cells that scans at the places can reach, listed once for all of them."""
+        reach = self.beams.range_max + self.beams.rim + MARGIN
+        try:
+            return LocalCells.around(cells, places, reach, self.registration)
+        except RegistrationError:
+            return cells  # of which each place says so itself
 
     def scene(self, surfels: Surfels, places: Float64) -> Scene | None:
         """The scene that places near one another share; None: nothing is in view."""
@@ -202,40 +224,67 @@ class _View:
         """The surfels that a beam from any of the places can meet, and a few more."""
         return in_view(surfels, places, self.fov_deg, self.beams.range_max, self.beams.rim)
 
-    def seen_from(
-        self,
-        scene: Scene | None,
-        ghosts: Scene | None,
-        cells: Cells,
-        place: Float64,
-        heading: float,
-    ) -> Row:
+    def seen_from(self, around: "_Block | None", place: Float64, heading: float) -> Row:
         """The row of a place; columns that are not known there are left out."""
-        n = len(self.beams)
-        if scene is None:
-            return {"status": "missing", "reason": NOTHING.format(0, n)}
-        place_mm = whole_places(place)
+        if around is None:
+            return {"status": "missing", "reason": NOTHING.format(0, len(self.beams))}
+        scene, place_mm = around.scene, whole_places(place)
         walled = near_share(scene, place_mm, self.beams, self.seeing.range_min)
         if walled > INSIDE:
             reason = WALLED.format(walled, self.seeing.range_min)
             return {"status": "failed", "reason": reason}
-        scan = virtual_scan(scene, place_mm, heading, self.seeing, self.beams)
+        found = look(scene, place_mm, heading, self.seeing, self.beams)
+        scan = virtual_scan(scene, found, place_mm, self.seeing, self.beams)
         view: Row = {
             "ob_returns": scan.return_share,
             "ob_unmapped": scan.unmapped_share,
-            "ob_ghosts": self.hidden_by(ghosts, scan, place_mm, heading),
+            "ob_ghosts": self.hidden_by(around.ghosts, scan, place_mm, heading),
         }
         if not len(scan.points):
-            return {**view, "status": "missing", "reason": NOTHING.format(0, n)}
+            reason = NOTHING.format(0, len(self.beams))
+            return {**view, "status": "missing", "reason": reason}
+        T_map_lidar = np.eye(4)
+        T_map_lidar[:2, :2] = _turn(heading)
+        T_map_lidar[:3, 3] = place_mm / MM_PER_M
+        scans = self.scans(around, found, place_mm, heading)
         try:
-            return {
-                **view,
-                **self._held(cells, scan, place_mm, heading),
-                "status": "done",
-                "reason": "",
-            }
+            held = hessian_factors(around.cells, scan.points, T_map_lidar, self.registration)
+            drives = self.drives(around.cells, scans, T_map_lidar)
         except RegistrationError as error:
             return {**view, "status": "failed", "reason": str(error)}
+        return {**view, **held, **virtual_drive(drives), "status": "done", "reason": ""}
+
+    def scans(
+        self, around: "_Block", found: tuple[Returns, ...], place_mm: Int64, heading: float
+    ) -> Iterator[Float64]:
+        """The points of each draw, in the lidar frame: of the street as it was mapped, then of
+        others.
+        """
+        seeing, beams = self.seeing, self.beams
+        still = seeing.draws - seeing.worlds
+        for draw in range(still):
+            yield virtual_scan(around.scene, found, place_mm, seeing, beams, draw).points
+        for draw, scene in enumerate(around.worlds, start=still):
+            met = look(scene, place_mm, heading, seeing, beams)
+            yield scan_in_world(met, place_mm, seeing, beams, draw)
+
+    def drives(
+        self, cells: Cells | LocalCells, scans: Iterator[Float64], T_map_lidar: Float64
+    ) -> list[Ends]:
+        """Where the registrations of each draw end; draws that cannot be registered are left out.
+
+        Raises:
+            RegistrationError: none can be; why the first cannot.
+        """
+        ends, failures = [], []
+        for starts, points in zip(self.starts, scans, strict=True):
+            try:
+                ends.append(drive(cells, points, T_map_lidar, self.registration, starts))
+            except RegistrationError as error:
+                failures.append(error)
+        if not ends:
+            raise failures[0]
+        return ends
 
     def hidden_by(
         self, ghosts: Scene | None, scan: VirtualScan, place_mm: Int64, heading: float
@@ -243,25 +292,30 @@ class _View:
         """Share of the beams that ghosts would stop before the return of the scan."""
         if ghosts is None:
             return 0.0
-        ranges, _, _ = first_returns(ghosts, place_mm, heading, self.seeing, self.beams)
+        found = look(ghosts, place_mm, heading, self.seeing, self.beams)
+        ranges = np.concatenate([met.ranges for met in found])
         return float((ranges < scan.ranges).mean())
 
-    def _held(
-        self, cells: Cells, scan: VirtualScan, place_mm: Int64, heading: float
-    ) -> dict[str, float]:
-        T_map_lidar = np.eye(4)
-        T_map_lidar[:2, :2] = _turn(heading)
-        T_map_lidar[:3, 3] = place_mm / MM_PER_M
-        return {
-            **hessian_factors(cells, scan.points, T_map_lidar, self.registration),
-            **virtual_drive.virtual_drive(
-                cells, scan.points, T_map_lidar, self.registration, self.starts
-            ),
-        }
+
+@dataclass(frozen=True, eq=False)
+class _Block:
+    """What places near one another share."""
+
+    scene: Scene
+    """What is in view."""
+    ghosts: Scene | None
+    """The ghosts that would be."""
+    worlds: tuple[Scene, ...]
+    """What is in view in streets that are not as they were mapped, draw by draw."""
+    cells: Cells | LocalCells
+    """The cells around."""
 
 
 def hessian_factors(
-    cells: Cells, points: Float64, T_map_lidar: Float64, registration: RegistrationSettings
+    cells: Cells | LocalCells,
+    points: Float64,
+    T_map_lidar: Float64,
+    registration: RegistrationSettings,
 ) -> dict[str, float]:
     """How well a scan constrains the pose: the NDT Hessian and score at the place, without a step.
 
@@ -274,17 +328,18 @@ def hessian_factors(
     Raises:
         RegistrationError: as `register`.
     """
-    voxels = _distinct(np.floor(transform(T_map_lidar, points) / cells.cell_size).astype(np.int64))
+    index = (cells.cells if isinstance(cells, LocalCells) else cells).index
+    size = (cells.cells if isinstance(cells, LocalCells) else cells).cell_size
+    voxels = _distinct(np.floor(transform(T_map_lidar, points) / size).astype(np.int64))
     still = registration.model_copy(update={"iterations_max": 0})
-    near = _within_reach(cells, voxels)
-    found = register(near if len(near) else cells, points, T_map_lidar, still)
+    found = register(cells, points, T_map_lidar, still)
     heading = math.atan2(T_map_lidar[1, 0], T_map_lidar[0, 0])
     return {
         **information(-found.hessian[0], heading),
         "ob_score": float(found.score[0]) / found.points,
         "ob_nvtl": float(found.nvtl[0]),
         "ob_points": float(found.points),
-        "ob_cells": float((cell_of_points(voxels, 1, cells.index) >= 0).sum()),
+        "ob_cells": float((cell_of_points(voxels, 1, index) >= 0).sum()),
     }
 
 
@@ -292,21 +347,6 @@ def _distinct(voxels: Int64) -> Int64:
     """Voxels without repetition, lexicographic."""
     index, _ = cell_sums(voxels, 1)
     return index
-
-
-def _within_reach(cells: Cells, voxels: Int64) -> Cells:
-    """The cells that a point in one of the voxels can be scored against."""
-    around = np.array(list(itertools.product((-1, 0, 1), repeat=3)))
-    wanted = _distinct((voxels[:, None] + around).reshape(-1, 3))
-    rows = np.sort(cell_of_points(wanted, 1, cells.index))
-    rows = rows[rows >= 0]
-    return Cells(
-        cells.index[rows],
-        cells.count[rows],
-        cells.mean[rows],
-        cells.covariance[rows],
-        cells.cell_size,
-    )
 
 
 def information(L_map: Float64, heading: float) -> dict[str, float]:

@@ -1,30 +1,41 @@
 """The surfels of a map, tile by tile: a virtual scan is cast at them instead of points.
 
 One per voxel of 0.2 m that holds map points, or per voxel of the map's leaf where that is larger: a
-small disc in the plane of the points around it, or a ball where they form no plane (definitions,
-section 4.2).
+small disc in the plane of the points around it, or a ball where they form no plane. Where the
+points are too sparse for that, a disc per voxel of twice the edge (definitions, section 4.2).
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tilestream.factors.ghosts import REACH_EDGES as GHOST_EDGES
+from tilestream.factors.ghosts import ghosts_among
 from tilestream.grid import MM_PER_M, Box, TileKey, whole_mm
-from tilestream.kernels.cells import cell_sums
+from tilestream.kernels.cells import cell_of_points, cell_sums
 from tilestream.kernels.depth_image import thin
 from tilestream.kernels.surfels import surfels_of
 from tilestream.records import Float64, Int64
 from tilestream.store import Tile, TileStore, TileTable
 
-SURFELS_VERSION = 1
+SURFELS_VERSION = 2
 """Raise it when the surfels that are made from the same points change."""
 FINEST_MM = 200
 """Smallest edge of the voxels of surfels [mm]."""
-REACH_EDGES = 4
-"""How far from its voxel the points that a surfel depends on can lie, with their voxels [edges]."""
+PLANE_EDGES = 4
+"""How far from its voxel the points of a surfel's plane can lie, with their voxels [edges]."""
+COARSE = 2
+"""Edge of the voxels of the second level [edges]."""
+CLEAR_EDGES = COARSE * PLANE_EDGES
+"""How far around a tile it is known what is a ghost [edges]."""
+FINE_EDGES = CLEAR_EDGES + GHOST_EDGES
+"""How far around a tile the first level is made [edges]."""
+REACH_EDGES = FINE_EDGES + PLANE_EDGES
+"""How far around a tile its surfels depend on points [edges]: 5.2 m."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,13 +48,20 @@ class Surfels:
     """(n, 3) unit normals, 32767 for 1, sign arbitrary; 0 of a ball."""
     radius_mm: NDArray[np.int32]
     """(n,) radii [mm]."""
+    ghost: NDArray[np.bool_]
+    """(n,) whether it is of traffic that moved during the survey (`ghosts.py`)."""
 
     def __len__(self) -> int:
         return len(self.centre_mm)
 
     def where(self, chosen: NDArray[np.bool_]) -> Self:
         """The surfels where `chosen` (n,) is True."""
-        return type(self)(self.centre_mm[chosen], self.normal[chosen], self.radius_mm[chosen])
+        return type(self)(*(getattr(self, part.name)[chosen] for part in fields(self)))
+
+    @property
+    def flat(self) -> NDArray[np.bool_]:
+        """(n,) whether it is a disc."""
+        return np.asarray(self.normal.any(axis=1))
 
 
 def surfel_mm(store: TileStore) -> int:
@@ -66,15 +84,47 @@ def surfels_table(edge_mm: int) -> TileTable:
 def tile_surfels(store: TileStore, key: TileKey) -> Surfels:
     """The surfels of the voxels whose lowest corners lie in a tile: the same for any tiling.
 
+    First level by voxel, then second level by voxel.
+
     Raises:
         TileNotReadyError: the tile, or a neighbour that exists, is not done; says why.
     """
-    edge = surfel_mm(store)
+    edge, core = surfel_mm(store), store.grid.core(key)
     store.tile(key)  # which must be there, unlike its neighbours
-    points = store.points_in(store.grid.core(key).grown(REACH_EDGES * edge))
+    points = store.points_in(core.grown(REACH_EDGES * edge))
     index, sums = cell_sums(points, edge)
-    low, core = index * edge, store.grid.core(key)
-    return Surfels(*surfels_of(thin(index, sums, edge), index, edge, core.holds(low)))
+    made = core.grown(FINE_EDGES * edge).holds(index * edge)
+    centroids = thin(index, sums, edge)
+    fine = _of_voxels(centroids, index, edge, made)
+    fine = replace(fine, ghost=ghosts_among(fine.centre_mm, edge))
+    voxels = index[made]
+    coarse = _coarse(centroids[made][~fine.ghost], voxels[fine.flat & ~fine.ghost], edge, core)
+    return _together([fine.where(core.holds(voxels * edge)), coarse])
+
+
+def _of_voxels(points: Int64, index: Int64, edge: int, own: NDArray[np.bool_]) -> Surfels:
+    """A surfel for each of the voxels `own`, none of them a ghost."""
+    return Surfels(*surfels_of(points, index, edge, own), np.zeros(int(own.sum()), np.bool_))
+
+
+def _coarse(points: Int64, discs: Int64, edge: int, core: Box) -> Surfels:
+    """The second level of a tile: discs in its larger voxels in which no disc of the first stands.
+
+    Args:
+        points: (n, 3) centroids of the first level's voxels that are no ghosts, also around the
+            tile [mm].
+        discs: (m, 3) voxels of its discs, lexicographic.
+        edge: edge of its voxels [mm].
+        core: the tile.
+    """
+    index, sums = cell_sums(points, COARSE * edge)
+    made = core.holds(index * COARSE * edge)
+    found = _of_voxels(thin(index, sums, COARSE * edge), index, COARSE * edge, made)
+    taken, _ = cell_sums(discs, COARSE)
+    bare = (
+        cell_of_points(index[made], 1, taken) < 0 if len(taken) else np.ones(len(found), np.bool_)
+    )
+    return found.where(found.flat & bare)
 
 
 def _columns(store: TileStore, key: TileKey, surfels: Surfels) -> dict[str, NDArray[Any]]:
@@ -84,6 +134,7 @@ def _columns(store: TileStore, key: TileKey, surfels: Surfels) -> dict[str, NDAr
         "centre": np.ascontiguousarray((surfels.centre_mm - origin).T.astype(np.int32)),
         "normal": np.ascontiguousarray(surfels.normal.T),
         "radius": surfels.radius_mm,
+        "ghost": surfels.ghost,
     }
 
 
@@ -95,6 +146,7 @@ def _surfels(tile: Tile) -> Surfels:
         kept["centre"].T.astype(np.int64) + origin,
         np.ascontiguousarray(kept["normal"].T),
         kept["radius"],
+        kept["ghost"],
     )
 
 
@@ -104,18 +156,23 @@ def surfels_in(store: TileStore, box: Box) -> Surfels:
     Raises:
         TileNotReadyError: a tile in reach failed or was skipped; says why.
     """
-    parts = [_NONE]
-    for tile in store.tiles_over(box):
-        found = _surfels(tile)
-        parts.append(found.where(box.holds(found.centre_mm)))
-    return Surfels(
-        np.concatenate([part.centre_mm for part in parts]),
-        np.concatenate([part.normal for part in parts]),
-        np.concatenate([part.radius_mm for part in parts]),
+    parts = [_surfels(tile) for tile in store.tiles_over(box)]
+    return _together([_NONE, *(part.where(box.holds(part.centre_mm)) for part in parts)])
+
+
+def _together(parts: Sequence[Surfels]) -> Surfels:
+    columns = (
+        np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(Surfels)
     )
+    return Surfels(*columns)
 
 
-_NONE = Surfels(np.zeros((0, 3), np.int64), np.zeros((0, 3), np.int16), np.zeros(0, np.int32))
+_NONE = Surfels(
+    np.zeros((0, 3), np.int64),
+    np.zeros((0, 3), np.int16),
+    np.zeros(0, np.int32),
+    np.zeros(0, np.bool_),
+)
 
 
 def in_view(

@@ -1,120 +1,239 @@
 """The virtual drive: where registrations of the virtual scan end (definitions, section 4.5).
 
-The paper's label, with the virtual scan in place of a real one: some of its 317 starts around the
-sample point, spread and weighted so that they represent the whole disc.
+The paper's label, with virtual scans in place of a real one: some of its 317 starts around the
+sample point, spread and weighted so that they represent the whole disc. Where a registration ends
+is random to a degree, so several scans are registered, each from other starts: the draws.
 """
 
+import itertools
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
+from scipy.spatial.transform import Rotation
 
-from tilestream.label import FAILED, NEAR, disc_starts, start_errors
+from tilestream.label import FAILED, disc_starts, start_errors
+from tilestream.local_map import LocalCells
 from tilestream.matcher import RegistrationSettings
-from tilestream.records import Cells, Column, Float64
+from tilestream.records import Cells, Column, Criterion, Float64, Int64
 from tilestream.registration import register
 
-STRATA = ((0.0, 0.5, 1.0 / 8.0), (0.5, 0.75, 1.0 / 4.0), (0.75, 1.0, 5.0 / 8.0))
+RINGS = {"near": (0.0, 0.5, 1 / 4), "middle": (0.5, 0.75, 1 / 4), "far": (0.75, 1.0, 1 / 2)}
 """Rings of the disc of starts: inner and outer radius as shares of the disc's, and share of the
-starts. Far starts decide the tail."""
+starts of a draw. The near one, within 1.0 m, makes the floor; far starts decide the tail."""
+AXES = ("along", "across", "up", "roll", "pitch", "yaw")
+"""The six signed errors of a start."""
 NEIGHBOURS = 2.0
 """Virtual drives within this distance along the route are averaged [m]: the radius of the disc of
 starts."""
 GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
-"""Turn from one start to the next, so that any number of them is spread evenly [rad]."""
+"""Turn from one start to the next, so that any number of them is spread evenly [rad]; half of it
+from the starts of one draw to those of the next."""
 
 
-def _column(name: str, unit: str, meaning: str, source: str = "definitions, section 4.5") -> Column:
-    return Column(name, "OB", unit, meaning, source, "observability")
+def _column(
+    name: str,
+    unit: str,
+    meaning: str,
+    source: str = "definitions, section 4.5",
+    kind: Criterion = "OB",
+) -> Column:
+    return Column(name, kind, unit, meaning, source, "observability")
 
 
-COLUMNS = (
+PART_COLUMNS = (
     _column("vd_mean", "m", "Mean 3D error of the virtual drive, weighted by area."),
     _column("vd_floor", "m", "The same of the starts within 1.0 m: what no start helps."),
     _column("vd_tail", "m", "What the far starts add.", "vd_mean - vd_floor"),
     _column("vd_p_fail", "1", "Share of the disc whose starts end more than 0.5 m away."),
-    _column("vd_median", "m", "Median 3D error of the others. NaN: there are none."),
     _column("vd_along", "m", "Mean of abs(along), the error along the route."),
     _column("vd_across", "m", "Mean of abs(across), the error across the route."),
     _column("vd_up", "m", "Mean of abs(up), the error in map z."),
 )
+"""What a draw says; the table has the means over the draws."""
+SPREAD_COLUMNS = tuple(
+    _column(
+        f"{part.name}_sd",
+        part.unit,
+        f"Standard deviation of {part.name} over the draws; NaN of one draw.",
+        kind="place",
+    )
+    for part in PART_COLUMNS
+)
+MOMENT_COLUMNS = (
+    *(
+        _column(
+            f"vd_{ring}_{axis}",
+            "m" if axis in AXES[:3] else "rad",
+            f"Mean signed error in {axis} of the starts of the {ring} ring, all draws.",
+            kind="place",
+        )
+        for ring in RINGS
+        for axis in AXES
+    ),
+    *(
+        _column(
+            f"vd_{ring}_{a}_{b}",
+            ("m^2", "m rad", "rad^2")[(a not in AXES[:3]) + (b not in AXES[:3])],
+            f"Mean of {a} times {b} of the same starts.",
+            kind="place",
+        )
+        for ring in RINGS
+        for a, b in itertools.combinations_with_replacement(AXES, 2)
+    ),
+)
+"""First and second moments of the errors, ring by ring: a covariance can be made of them."""
+COLUMNS = (
+    *PART_COLUMNS,
+    _column("vd_median", "m", "Median 3D error of those that do not fail. NaN: there are none."),
+    _column("vd_draws", "1", "Draws: scans that could be registered.", kind="place"),
+    *SPREAD_COLUMNS,
+    *MOMENT_COLUMNS,
+)
 
-AVERAGED = tuple(column.name for column in COLUMNS if column.name != "vd_median")
-"""Columns that are averaged along the route; `vd_median` may be NaN, so it is not."""
+AVERAGED = tuple(column.name for column in PART_COLUMNS)
+"""Columns that are averaged along the route."""
 SLACK = 1e-6
 """Arc lengths are sums: neighbours at the full distance may lie this much beyond it [m]."""
 
 
-def stratified_starts(count: int | None = 64) -> tuple[Float64, Float64]:
-    """Some of the paper's 317 starts, spread evenly over each of three rings of their disc.
+@dataclass(frozen=True, eq=False)
+class Starts:
+    """Some of the paper's 317 starts."""
+
+    offset: Float64
+    """(k, 2) in map x and y [m]."""
+    weight: Float64
+    """(k,) share of the disc that each represents; their sum is 1."""
+    ring: Int64
+    """(k,) number of its ring in `RINGS`."""
+
+
+def stratified_starts(count: int | None = 32, draw: int = 0) -> Starts:
+    """Starts that are spread evenly over each of three rings of their disc.
 
     Args:
         count: how many, 8 or more; None, or as many as there are: all of them.
-
-    Returns:
-        (k, 2) offsets in map x and y [m], and (k,) weights that sum to 1: the share of the disc's
-        starts that each represents.
+        draw: another number gives others.
     """
     disc = disc_starts()
-    if count is None or count >= len(disc):
-        return disc, np.full(len(disc), 1.0 / len(disc))
     radius = np.hypot(disc[:, 0], disc[:, 1])
     whole = float(radius.max())
+    edges = [outer * whole + 1e-9 for _, outer, _ in RINGS.values()]
+    ring = np.searchsorted(edges, radius)
+    if count is None or count >= len(disc):
+        return Starts(disc, np.full(len(disc), 1.0 / len(disc)), ring)
     chosen, weights = [], []
-    for inner, outer, share in STRATA:
-        ring = (radius > inner * whole + 1e-9) | (inner == 0.0)
-        rows = np.flatnonzero(ring & (radius <= outer * whole + 1e-9))
+    for number, (inner, outer, share) in enumerate(RINGS.values()):
+        rows = np.flatnonzero(ring == number)
         wanted = min(max(round(share * count), 1), len(rows))
+        weights.append(np.full(wanted, len(rows) / len(disc) / wanted))
         pairs = (wanted + 1) // 2
         step = np.arange(pairs)
         area = inner**2 + (outer**2 - inner**2) * (step + 0.5) / pairs
-        spiral = whole * np.sqrt(area) * np.exp(1j * GOLDEN_ANGLE * step)
+        spiral = whole * np.sqrt(area) * np.exp(1j * GOLDEN_ANGLE * (step + 0.5 * draw))
         for goal in np.column_stack([spiral, -spiral]).ravel()[:wanted]:
-            away = np.abs(disc[rows] @ (1.0, 1.0j) - goal)
-            nearest = int(np.argmin(away))
+            nearest = int(np.argmin(np.abs(disc[rows] @ (1.0, 1.0j) - goal)))
             chosen.append(rows[nearest])
             rows = np.delete(rows, nearest)
-        weights.append(np.full(wanted, (len(rows) + wanted) / len(disc) / wanted))
-    return disc[chosen], np.concatenate(weights)
+    return Starts(disc[chosen], np.concatenate(weights), ring[chosen])
 
 
-def virtual_drive(
-    cells: Cells,
+@dataclass(frozen=True, eq=False)
+class Ends:
+    """Where the registrations of one scan end: a draw of the virtual drive."""
+
+    starts: Starts
+    """Where they started."""
+    error: Float64
+    """(k,) 3D errors [m]."""
+    axes: Float64
+    """(k, 6) signed errors, `AXES` [m, rad]."""
+
+
+def drive(
+    cells: Cells | LocalCells,
     points: Float64,
     T_map_lidar: Float64,
     settings: RegistrationSettings,
-    starts: tuple[Float64, Float64],
-) -> dict[str, float]:
-    """Where a scan's registrations end, in the columns of `COLUMNS`.
+    starts: Starts,
+) -> Ends:
+    """Where a scan's registrations end.
 
     Args:
         cells: the map around the place.
         points: (n, 3) the virtual scan, in the lidar frame [m].
         T_map_lidar: (4, 4) the place from which it was taken.
         settings: the matcher.
-        starts: offsets and weights, see `stratified_starts`.
+        starts: where they start.
 
     Raises:
         RegistrationError: as `register`.
     """
-    offsets, weight = starts
-    poses = np.repeat(T_map_lidar[None], len(offsets), axis=0)
-    poses[:, :2, 3] += offsets
-    errors = start_errors(T_map_lidar, register(cells, points, poses, settings).T_map_lidar)
-    error = errors["error"]
-    near = np.hypot(offsets[:, 0], offsets[:, 1]) <= NEAR + 1e-9
+    poses = np.repeat(T_map_lidar[None], len(starts.offset), axis=0)
+    poses[:, :2, 3] += starts.offset
+    ends = register(cells, points, poses, settings).T_map_lidar
+    errors = start_errors(T_map_lidar, ends) | _turns(T_map_lidar, ends)
+    return Ends(starts, errors["error"], np.column_stack([errors[axis] for axis in AXES]))
+
+
+def _turns(T: Float64, T_ends: Float64) -> dict[str, Float64]:
+    w = Rotation.from_matrix(T_ends[:, :3, :3] @ T[:3, :3].T).as_rotvec()
+    h = math.atan2(T[1, 0], T[0, 0])
+    c, s = math.cos(h), math.sin(h)
+    return {
+        "roll": w[:, 0] * c + w[:, 1] * s,
+        "pitch": w[:, 1] * c - w[:, 0] * s,
+        "yaw": w[:, 2],
+    }
+
+
+def virtual_drive(drives: Sequence[Ends]) -> dict[str, float]:
+    """What draws say together, in the columns of `COLUMNS`; at least one."""
+    said = pd.DataFrame([_parts(one) for one in drives])
+    spread = said[list(AVERAGED)].std(ddof=1)
+    return {
+        **{str(name): float(value) for name, value in said.mean().items()},
+        "vd_draws": float(len(drives)),
+        **{f"{name}_sd": float(value) for name, value in spread.items()},
+        **_moments(drives),
+    }
+
+
+def _parts(ends: Ends) -> dict[str, float]:
+    """What a draw says."""
+    weight, error = ends.starts.weight, ends.error
+    near = ends.starts.ring == 0
+    mean = float(weight @ error)
     floor = float(weight[near] @ error[near] / weight[near].sum())
     held = error <= FAILED
+    along, across, up = weight @ np.abs(ends.axes[:, :3])
     return {
-        "vd_mean": float(weight @ error),
+        "vd_mean": mean,
         "vd_floor": floor,
-        "vd_tail": float(weight @ error) - floor,
+        "vd_tail": mean - floor,
         "vd_p_fail": float(weight @ ~held),
         "vd_median": weighted_median(error[held], weight[held]),
-        "vd_along": float(weight @ np.abs(errors["along"])),
-        "vd_across": float(weight @ np.abs(errors["across"])),
-        "vd_up": float(weight @ np.abs(errors["up"])),
+        "vd_along": float(along),
+        "vd_across": float(across),
+        "vd_up": float(up),
     }
+
+
+def _moments(drives: Sequence[Ends]) -> dict[str, float]:
+    """`MOMENT_COLUMNS`, all starts of a ring alike."""
+    axes = np.vstack([one.axes for one in drives])
+    ring = np.concatenate([one.starts.ring for one in drives])
+    found: dict[str, float] = {}
+    for number, name in enumerate(RINGS):
+        here = axes[ring == number]
+        mean, square = here.mean(axis=0), np.einsum("ki,kj->ij", here, here) / len(here)
+        found |= {f"vd_{name}_{axis}": float(value) for axis, value in zip(AXES, mean, strict=True)}
+        for (i, a), (j, b) in itertools.combinations_with_replacement(enumerate(AXES), 2):
+            found[f"vd_{name}_{a}_{b}"] = float(square[i, j])
+    return found
 
 
 def weighted_median(values: Float64, weight: Float64) -> float:

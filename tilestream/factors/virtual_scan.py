@@ -2,18 +2,20 @@
 4.3).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tilestream.factors.surfels import Surfels
+from tilestream.factors.worlds import Dice, foliage_gone, kept, stopped, world_at
 from tilestream.grid import MM_PER_M
 from tilestream.kernels.fixed_order import turned
 from tilestream.kernels.surfels import NORMAL_ONE
 from tilestream.kernels.virtual_scan import (
     BRICK,
     FREE,
+    RADIUS,
     VOXELS,
     Bricks,
     bound_bricks,
@@ -22,13 +24,15 @@ from tilestream.kernels.virtual_scan import (
     leave_map,
     mark_bricks,
 )
-from tilestream.preprocessing import GOLDEN, mixed
 from tilestream.records import Float64, Int64
 from tilestream.sensor import Carrier, rim_of
 from tilestream.settings import VirtualSettings
 
 COLUMN_MM = 10_000
 """Edge of the columns that tell where the map has anything [mm]."""
+NEAR_GROUND, LOW_SHARE, USUAL_HEIGHT = 20.0, 0.2, 2.0
+"""The road is taken to be where this share of the returns below the lidar within 20 m lie lower; as
+far below the lidar as usual where there are none [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +45,8 @@ class Scene:
     """(nx, ny) columns of 10 m that hold any of the map."""
     mapped_corner: Int64
     """(2,) their lowest corner [mm, map frame]."""
+    surfels: Surfels
+    """What is indexed."""
 
     @classmethod
     def of(cls, surfels: Surfels, places_mm: Int64, edge_mm: int) -> "Scene":
@@ -69,7 +75,14 @@ class Scene:
         mapped[tuple((column - mapped_low).T)] = True
         bounds = bound_bricks(edge_mm, grid, voxels)
         bricks = Bricks(edge_mm, corner, grid, voxels, bounds, table)
-        return cls(bricks, mapped, mapped_low * COLUMN_MM)
+        return cls(bricks, mapped, mapped_low * COLUMN_MM, surfels)
+
+    def without_foliage(self, seed: int, draw: int) -> "Scene":
+        """The same scene without a part of what is not flat (`foliage_gone`)."""
+        gone = foliage_gone(self.surfels.centre_mm, ~self.surfels.flat, seed, draw)
+        table = self.bricks.surfels.copy()
+        table[gone, RADIUS] = 0.0  # no beam meets a ball without a radius
+        return replace(self, bricks=self.bricks._replace(surfels=table))
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +98,12 @@ class SensorBeams:
     """Usable range [m]."""
     range_noise: float
     """Standard deviation of a range [m]."""
+    ring: Int64
+    """(n,) number of the beam, 0 the lowest."""
+    phase: Float64
+    """(n,) when it fires, from -0.5 to 0.5 of a turn; 0 ahead."""
+    turn_s: float
+    """Duration of a turn [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,14 +122,20 @@ class Beams:
         """The beams of a vehicle, without its blind sector."""
         sensors = []
         for sensor in vehicle.sensors:
-            rays = sensor.rays().reshape(-1, 3)
+            rays = sensor.rays()
+            seen = sensor.fires(rays, seeing.blind_rear_deg)
+            firing, ring = np.nonzero(seen)
+            phase = firing / len(rays)
             reach = sensor.range_max if seeing.range_max is None else seeing.range_max
             sensors.append(
                 SensorBeams(
-                    sensor.in_base(rays[sensor.fires(rays, seeing.blind_rear_deg)]),
+                    sensor.in_base(rays[seen]),
                     sensor.mount.T_base_lidar[:3, 3],
                     min(reach, sensor.range_max),
                     sensor.range_noise,
+                    ring,
+                    phase - np.rint(phase),
+                    1.0 / sensor.rate_hz,
                 )
             )
         reach = max(sensor.range_max for sensor in sensors)
@@ -175,77 +200,104 @@ class VirtualScan:
     """Share of the beams that meet nothing and leave the mapped area."""
 
 
-def virtual_scan(
+def look(
     scene: Scene, place_mm: Int64, heading: float, seeing: VirtualSettings, beams: Beams
+) -> tuple[Returns, ...]:
+    """The first surfels that the beams of a vehicle at a place meet, sensor by sensor.
+
+    Args:
+        scene: the map around the place, as far as the beams reach.
+        place_mm: (3,) of the vehicle's origin [mm, map frame].
+        heading: direction of travel [rad, from the map's x axis].
+        seeing: from which range on something is met.
+        beams: its beams, `Beams.of(vehicle, seeing)`.
+    """
+    return tuple(
+        _cast(scene, place_mm, heading, sensor, seeing.range_min, sensor.range_max)
+        for sensor in beams.sensors
+    )
+
+
+def virtual_scan(
+    scene: Scene,
+    found: tuple[Returns, ...],
+    place_mm: Int64,
+    seeing: VirtualSettings,
+    beams: Beams,
+    draw: int = 0,
 ) -> VirtualScan:
     """The scan of a vehicle at a place: first returns, drop-outs, noise.
 
     A return at range r with cosine of incidence c comes back with the probability
     (1 - fading f) min(1, c / cos(grazing)), f rising linearly from 0 to 1 between `fading_from` and
     1 of the usable range. Its range gets normal noise. Both are drawn from the place in whole
-    millimetres and the number of the beam alone.
+    millimetres, the seed, the number of the draw and the number of the beam alone.
 
     Args:
-        scene: the map around the place, as far as the beams reach.
-        place_mm: (3,) of the vehicle's origin [mm, map frame].
-        heading: direction of travel [rad, from the map's x axis].
-        seeing: its drop-outs.
-        beams: its beams, `Beams.of(vehicle, seeing)`.
+        scene: the map around the place.
+        found: what the beams meet, from `look`.
+        place_mm: as of `look`.
+        seeing: as of `look`; its drop-outs.
+        beams: as of `look`.
+        draw: which of several scans.
     """
-    draw = draws(place_mm, seeing.seed, len(beams), 3)
-    parts, first = [], 0
-    for sensor in beams.sensors:
-        behind = first + len(sensor.direction)
-        found = _cast(scene, place_mm, heading, sensor, seeing.range_min, sensor.range_max)
-        parts.append(_measured(scene, found, sensor, seeing, draw[:, first:behind]))
-        first = behind
+    dice = Dice(place_mm, seeing.seed, draw)
+    parts = []
+    for sensor, met in zip(beams.sensors, found, strict=True):
+        came = dice.uniform(len(met.ranges)) < probability(
+            met.ranges, met.cosine, sensor.range_max, seeing
+        )
+        noise = dice.normal(sensor.range_noise, len(met.ranges))
+        points = sensor.direction[came] * (met.ranges + noise)[came, None] + met.origin
+        parts.append((met.ranges, met.cosine, came, _leaves(scene, met, sensor), points))
     ranges, cosine, came, left, points = (np.concatenate(part) for part in zip(*parts, strict=True))
     return VirtualScan(ranges, cosine, came, points, float(came.mean()), float(left.mean()))
 
 
-def _measured(
-    scene: Scene, found: Returns, sensor: SensorBeams, seeing: VirtualSettings, draw: Float64
-) -> tuple[Float64, Float64, NDArray[np.bool_], NDArray[np.bool_], Float64]:
-    """What comes back to a sensor: ranges, cosines, which return, which leave the map, points in
-    the frame of the vehicle; from the (3, n) random numbers of its beams.
-    """
-    reach = sensor.range_max * MM_PER_M
-    left = leave_map(
+def _leaves(scene: Scene, met: Returns, sensor: SensorBeams) -> NDArray[np.bool_]:
+    """(n,) which beams meet nothing and leave the mapped area."""
+    left: NDArray[np.bool_] = leave_map(
         scene.mapped,
         scene.mapped_corner,
         COLUMN_MM,
-        found.place_mm,
-        found.direction,
-        found.ranges,
-        reach,
+        met.place_mm,
+        met.direction,
+        met.ranges,
+        sensor.range_max * MM_PER_M,
     )
-    luck, radius, turn = draw
-    came = luck < probability(found.ranges, found.cosine, sensor.range_max, seeing)
-    noise = np.sqrt(-2.0 * np.log(radius[came])) * np.cos(2.0 * np.pi * turn[came])
-    measured = found.ranges[came] + sensor.range_noise * noise
-    points = sensor.direction[came] * measured[:, None] + found.origin
-    return found.ranges, found.cosine, came, left, points
+    return left
 
 
-def first_returns(
-    scene: Scene, place_mm: Int64, heading: float, seeing: VirtualSettings, beams: Beams
-) -> tuple[Float64, Float64, Float64]:
-    """The first surfels that the beams of a vehicle at a place meet; arguments as of
-    `virtual_scan`.
-
-    Returns:
-        (n,) ranges [m], inf where nothing is met; (n,) cosines of incidence, 0 there; (n, 3)
-        directions in the map frame.
+def scan_in_world(
+    found: tuple[Returns, ...], place_mm: Int64, seeing: VirtualSettings, beams: Beams, draw: int
+) -> Float64:
+    """(m, 3) the points of a scan in a street that is not as it was mapped (`worlds.py`), in the
+    frame of the vehicle [m]; arguments as of `virtual_scan`.
     """
-    found = [
-        _cast(scene, place_mm, heading, sensor, seeing.range_min, sensor.range_max)
-        for sensor in beams.sensors
-    ]
-    ranges, cosine, direction = (
-        np.concatenate([getattr(part, name) for part in found])
-        for name in ("ranges", "cosine", "direction")
-    )
-    return ranges, cosine, direction
+    dice = Dice(place_mm, seeing.seed, draw)
+    rings = max(int(sensor.ring.max()) + 1 for sensor in beams.sensors)
+    world = world_at(dice, _ground_below(found, beams), rings, beams.sensors[0].turn_s)
+    parts = []
+    for sensor, met in zip(beams.sensors, found, strict=True):
+        reach = seeing.range_min, sensor.range_max
+        ranges, cosine = stopped(world, sensor.direction, met.ranges, met.cosine, reach)
+        came = kept(world, dice, ranges, cosine, sensor.range_max)
+        noise = dice.normal(sensor.range_noise, len(ranges)) + world.bias[sensor.ring]
+        points = sensor.direction[came] * (ranges + noise)[came, None] + met.origin
+        points[:, 0] += world.slip * sensor.phase[came]
+        parts.append(points)
+    return np.concatenate(parts)
+
+
+def _ground_below(found: tuple[Returns, ...], beams: Beams) -> float:
+    """Height of the road above the vehicle's origin [m], from what its beams meet around it."""
+    heights = []
+    for sensor, met in zip(beams.sensors, found, strict=True):
+        at = sensor.direction * np.where(np.isfinite(met.ranges), met.ranges, 0.0)[:, None]
+        near = (np.hypot(at[:, 0], at[:, 1]) < NEAR_GROUND) & (at[:, 2] < 0.0)
+        heights.append((at[near] + met.origin)[:, 2])
+    below = np.concatenate(heights)
+    return float(np.quantile(below, LOW_SHARE)) if len(below) else -USUAL_HEIGHT
 
 
 def _cast(
@@ -279,17 +331,3 @@ def probability(
     far = np.clip((np.where(there, ranges, 0.0) - seeing.fading_from * range_max) / span, 0.0, 1.0)
     grazing = np.minimum(cosine / np.cos(np.deg2rad(seeing.grazing_deg)), 1.0)
     return np.where(there, (1.0 - seeing.fading * far) * grazing, 0.0)
-
-
-def draws(place_mm: Int64, seed: int, beams: int, per_beam: int) -> Float64:
-    """(per_beam, beams) uniform random numbers in (0, 1) from the place, the seed and the beam
-    alone.
-
-    splitmix64 (Steele, Lea and Flood 2014), counted from a hash of the place.
-    """
-    state = np.array([seed], np.uint64)
-    for coordinate in place_mm.astype(np.int64).view(np.uint64):
-        state = mixed(state + GOLDEN) ^ coordinate
-    count = np.arange(1, per_beam * beams + 1, dtype=np.uint64).reshape(per_beam, beams)
-    bits = mixed(mixed(state + GOLDEN) + count * GOLDEN) >> np.uint64(11)
-    return (bits.astype(np.float64) + 0.5) * 2.0**-53
