@@ -51,7 +51,6 @@ from scipy.stats import spearmanr
 from street_tiles import TILE, Floats, long_street
 
 import tilestream as ts
-from tilestream.factors.ghosts import ghosts_among
 from tilestream.factors.observability import (
     hessian_factors,
     in_view,
@@ -59,13 +58,19 @@ from tilestream.factors.observability import (
     whole_places,
 )
 from tilestream.factors.surfels import surfel_mm, surfels_in, tile_surfels
-from tilestream.factors.virtual_drive import physics_offset, stratified_starts, virtual_drive
-from tilestream.factors.virtual_scan import Beams, Scene, virtual_scan
+from tilestream.factors.virtual_drive import (
+    ends_of,
+    physics_offset,
+    stratified_starts,
+    virtual_drive,
+)
+from tilestream.factors.virtual_scan import Beams, Scene, look, scan_in_world, virtual_scan
 from tilestream.formats.logs import open_log
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.formats.routes import route_of
 from tilestream.grid import MM_PER_M, Box
 from tilestream.kernels.virtual_scan import cast
+from tilestream.local_map import LocalCells
 from tilestream.pipeline.jobs.along_routes import observe_along
 from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
 from tilestream.settings import DriveSettings, VirtualSettings
@@ -127,29 +132,42 @@ def cost(folder: Path, spacing: float) -> pd.DataFrame:
         return Scene.of(near, whole_places(places), edge_mm)
 
     made = scene()
-    scan = virtual_scan(made, place_mm, heading, seeing, beams)
+    found = look(made, place_mm, heading, seeing, beams)
+    scan = virtual_scan(made, found, place_mm, seeing, beams)
     T_map_lidar = upright(place_mm, heading)
     points = len(store.tile(key).points())
     rows = [
         ("surfels of a tile", f"{points:,} points", cpu_ms(lambda: tile_surfels(store, key), 2)),
-        (
-            "ghosts among the surfels",
-            f"{len(surfels):,}, once per tile",
-            cpu_ms(lambda: ghosts_among(surfels, edge_mm), 2),
-        ),
         ("scene, per sample point", "25 share one", cpu_ms(scene, 3) / 25),
         (
-            "scan",
-            f"{len(beams.direction)} beams, {len(scan.points)} returns",
-            cpu_ms(lambda: virtual_scan(made, place_mm, heading, seeing, beams)),
+            "the same without foliage",
+            "25 share one",
+            cpu_ms(lambda: made.without_foliage(0, 3), 3) / 25,
+        ),
+        (
+            "beams cast",
+            f"{len(beams.direction)} beams",
+            cpu_ms(lambda: look(made, place_mm, heading, seeing, beams)),
+        ),
+        (
+            "a scan of them",
+            f"{len(scan.points)} returns",
+            cpu_ms(lambda: virtual_scan(made, found, place_mm, seeing, beams)),
+        ),
+        (
+            "a scan in another street",
+            f"{len(beams.direction)} beams",
+            cpu_ms(lambda: scan_in_world(found, place_mm, seeing, beams, 3)),
         ),
     ]
     for name, settings in MATCHERS.items():
-        at = (cells, scan.points, T_map_lidar, settings)
+        listing = partial(LocalCells.around, cells, places, 110.0, settings)
+        rows.append(("cells listed", f"{name}, 25 share them", cpu_ms(listing, 4) / 25))
+        at = (listing(), scan.points, T_map_lidar, settings)
         rows.append(("Hessian", name, cpu_ms(partial(hessian_factors, *at), 4)))
-        for count in (32, 64, 317):
-            drive = partial(virtual_drive, *at, stratified_starts(count))
-            rows.append((f"{count} starts", name, cpu_ms(drive, 4)))
+        for count in (32, 317):
+            starts = partial(ends_of, *at, stratified_starts(count))
+            rows.append((f"{count} starts", name, cpu_ms(starts, 4)))
     table = pd.DataFrame(rows, columns=["step", "of", "ms of one core"])
     return table.round({"ms of one core": 1})
 
@@ -221,7 +239,7 @@ def city(run: Path, every: int, changes: dict[str, Any]) -> None:
     show("Beams of the simulator's scans, cast in the map", agreement(np.concatenate(ranges)))
     estimates = {
         "virtual drive": {name: f"vd_{name}" for name in PAIRS},
-        f"its own scan, {seeing.starts} starts": {name: f"few_vd_{name}" for name in PAIRS},
+        "its own scan, as many starts": {name: f"few_vd_{name}" for name in PAIRS},
         "a repeated drive": {name: f"again_{label}" for name, label in PAIRS.items()},
     }
     show("Against the measured errors", against(table, estimates))
@@ -235,14 +253,14 @@ def themselves(
     settings: RunSettings,
 ) -> pd.DataFrame:
     """The columns of the virtual drive from the scans themselves."""
-    starts = stratified_starts(seeing.starts)
+    starts = stratified_starts(None if seeing.starts is None else seeing.draws * seeing.starts)
     rows = []
     for scan in open_log(str(log)).scans_at(labels["scan"].tolist()):
         assert scan.T_map_lidar is not None
         box = Box.around(scan.T_map_lidar[None, :3, 3], settings.looking_sensor.range_max + 10.0)
         cells = store.cells_in(box, settings.cell_size)
         how = (settings.label.registration, starts)
-        rows.append(virtual_drive(cells, scan.points, scan.T_map_lidar, *how))
+        rows.append(virtual_drive([ends_of(cells, scan.points, scan.T_map_lidar, *how)]))
     return pd.DataFrame(rows)
 
 
@@ -260,9 +278,8 @@ def compared(
         assert scan.T_map_lidar is not None
         place = scan.T_map_lidar[:3, 3]
         at, near = whole_places(place), seeing.range_min * MM_PER_M
-        surfels = surfels_in(store, Box.around(place[None], reach + 4.0))
-        if seeing.without_ghosts:
-            surfels = surfels.where(~ghosts_among(surfels, edge_mm))
+        surfels = surfels_in(store, Box.around(place[None], reach + 1.0))
+        surfels = surfels.where(~(surfels.ghost & seeing.without_ghosts))
         scene = Scene.of(surfels, at[None], edge_mm)
         true = np.linalg.norm(scan.points, axis=1)
         beams = np.ascontiguousarray(scan.points / true[:, None] @ scan.T_map_lidar[:3, :3].T)

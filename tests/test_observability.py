@@ -28,7 +28,7 @@ from tilestream.factors.virtual_drive import (
     SPREAD_COLUMNS,
     Ends,
     averaged_along,
-    drive,
+    ends_of,
     physics,
     physics_offset,
     stratified_starts,
@@ -179,7 +179,7 @@ def test_with_all_starts_it_is_the_label_of_the_virtual_scan(store: ts.TileStore
     T = np.eye(4)
     T[:3, 3] = PLACE
     settings = ts.RegistrationSettings.autoware()
-    found = virtual_drive([drive(cells, points, T, settings, stratified_starts(None))])
+    found = virtual_drive([ends_of(cells, points, T, settings, stratified_starts(None))])
     label = localization_error(cells, points, T, settings=settings)
     for name, expected in (
         ("vd_mean", label.error_mean),

@@ -296,6 +296,49 @@ def test_no_tiling_shows_in_the_surfels(cloud: Path, tmp_path: Path) -> None:
         np.testing.assert_array_equal(one.ghost, other.ghost)
 
 
+@pytest.fixture(scope="module")
+def sparse(tmp_path_factory: pytest.TempPathFactory) -> ts.TileStore:
+    """A wall whose left half was seen from near, and whose right half from afar."""
+    rng, folder = np.random.default_rng(6), tmp_path_factory.mktemp("sparse")
+    dense, thin_half = sheet(rng, 10.0, 8.0, 0.15), sheet(rng, 10.0, 8.0, 0.42)
+    ahead = np.array([5.0, 0.0])
+    wall = np.vstack([dense - ahead, thin_half + ahead])
+    points = np.column_stack([wall[:, 0], rng.normal(10.0, 0.01, len(wall)), wall[:, 1]])
+    path = folder / "wall.pcd"
+    write_pcd(path, points)
+    return ts.ingest(path, folder / "map.zarr", tile_size=7.0)
+
+
+def test_where_the_map_is_sparse_larger_discs_stand_and_elsewhere_none(
+    sparse: ts.TileStore,
+) -> None:
+    found = everything(sparse)
+    coarse = found.radius_mm > EDGE
+    assert coarse.sum() > 50
+    assert found.flat[coarse].all()
+    assert found.radius_mm.max() <= 3 * EDGE
+    assert (found.centre_mm[coarse, 0] > -500).all()
+    level_one = found.where(~coarse)
+    discs = {tuple(v) for v in (level_one.centre_mm[level_one.flat] // (2 * EDGE)).tolist()}
+    own = (found.centre_mm[coarse] // (2 * EDGE)).tolist()
+    assert np.mean([tuple(voxel) in discs for voxel in own]) < 0.05  # a centre may leave its voxel
+
+
+def test_no_beam_passes_a_wall_that_was_seen_from_afar(sparse: ts.TileStore) -> None:
+    rng, place = np.random.default_rng(7), np.zeros(3, np.int64)
+    goal = np.column_stack(
+        [rng.uniform(1.0, 9.0, 400), np.full(400, 10.0), rng.uniform(-3.0, 3.0, 400)]
+    )
+    beams = goal / np.linalg.norm(goal, axis=1, keepdims=True)
+    found, missed = everything(sparse), []
+    for surfels in (found, found.where(found.radius_mm <= EDGE)):
+        scene = Scene.of(surfels, place[None], EDGE)
+        ranges, cosine = np.empty(400), np.empty(400)
+        cast(scene.bricks, place, beams, 0.0, 50_000.0, ranges, cosine)
+        missed.append(np.isinf(ranges).mean())
+    assert missed[0] < 0.1 < 0.4 < missed[1]
+
+
 def test_a_table_of_surfels_is_used_while_it_is_up_to_date(cloud: Path, tmp_path: Path) -> None:
     store = ts.ingest(cloud, tmp_path / "map.zarr", tile_size=8.0)
     key = store.keys()[0]

@@ -18,7 +18,7 @@ from tilestream.errors import RegistrationError, TileNotReadyError, UsageError
 from tilestream.factors.surfels import Surfels, in_view, surfel_mm, surfels_in
 from tilestream.factors.table import NO_GROUND, places_of
 from tilestream.factors.virtual_drive import COLUMNS as DRIVE_COLUMNS
-from tilestream.factors.virtual_drive import Ends, drive, stratified_starts, virtual_drive
+from tilestream.factors.virtual_drive import Ends, ends_of, stratified_starts, virtual_drive
 from tilestream.factors.virtual_scan import (
     Beams,
     Returns,
@@ -279,7 +279,7 @@ class _View:
         ends, failures = [], []
         for starts, points in zip(self.starts, scans, strict=True):
             try:
-                ends.append(drive(cells, points, T_map_lidar, self.registration, starts))
+                ends.append(ends_of(cells, points, T_map_lidar, self.registration, starts))
             except RegistrationError as error:
                 failures.append(error)
         if not ends:

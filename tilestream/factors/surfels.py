@@ -8,6 +8,7 @@ points are too sparse for that, a disc per voxel of twice the edge (definitions,
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -18,7 +19,7 @@ from tilestream.factors.ghosts import ghosts_among
 from tilestream.grid import MM_PER_M, Box, TileKey, whole_mm
 from tilestream.kernels.cells import cell_of_points, cell_sums
 from tilestream.kernels.depth_image import thin
-from tilestream.kernels.surfels import surfels_of
+from tilestream.kernels.surfels import NORMAL_ONE, surfels_of
 from tilestream.records import Float64, Int64
 from tilestream.store import Tile, TileStore, TileTable
 
@@ -30,12 +31,13 @@ PLANE_EDGES = 4
 """How far from its voxel the points of a surfel's plane can lie, with their voxels [edges]."""
 COARSE = 2
 """Edge of the voxels of the second level [edges]."""
-CLEAR_EDGES = COARSE * PLANE_EDGES
-"""How far around a tile it is known what is a ghost [edges]."""
+CLEAR_EDGES = COARSE * (PLANE_EDGES + 1)
+"""How far around a tile it is known what is a ghost [edges]: a voxel of the second level farther
+than its planes reach."""
 FINE_EDGES = CLEAR_EDGES + GHOST_EDGES
 """How far around a tile the first level is made [edges]."""
 REACH_EDGES = FINE_EDGES + PLANE_EDGES
-"""How far around a tile its surfels depend on points [edges]: 5.2 m."""
+"""How far around a tile its surfels depend on points [edges]: 5.6 m."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +60,7 @@ class Surfels:
         """The surfels where `chosen` (n,) is True."""
         return type(self)(*(getattr(self, part.name)[chosen] for part in fields(self)))
 
-    @property
+    @cached_property
     def flat(self) -> NDArray[np.bool_]:
         """(n,) whether it is a disc."""
         return np.asarray(self.normal.any(axis=1))
@@ -97,34 +99,59 @@ def tile_surfels(store: TileStore, key: TileKey) -> Surfels:
     centroids = thin(index, sums, edge)
     fine = _of_voxels(centroids, index, edge, made)
     fine = replace(fine, ghost=ghosts_among(fine.centre_mm, edge))
-    voxels = index[made]
-    coarse = _coarse(centroids[made][~fine.ghost], voxels[fine.flat & ~fine.ghost], edge, core)
-    return _together([fine.where(core.holds(voxels * edge)), coarse])
+    voxels, real = index[made], ~fine.ghost
+    box = core.grown(COARSE * edge)
+    coarse, of = _coarse(centroids[made][real], voxels[fine.flat & real], edge, box)
+    stands = core.holds(voxels * edge) & ~_on(fine, voxels, coarse, of, edge)
+    return _together([fine.where(stands), coarse.where(core.holds(of * COARSE * edge))])
 
 
-def _of_voxels(points: Int64, index: Int64, edge: int, own: NDArray[np.bool_]) -> Surfels:
+def _of_voxels(
+    points: Int64, index: Int64, edge: int, own: NDArray[np.bool_], touching: bool = False
+) -> Surfels:
     """A surfel for each of the voxels `own`, none of them a ghost."""
-    return Surfels(*surfels_of(points, index, edge, own), np.zeros(int(own.sum()), np.bool_))
+    none = np.zeros(int(own.sum()), np.bool_)
+    return Surfels(*surfels_of(points, index, edge, own, touching), none)
 
 
-def _coarse(points: Int64, discs: Int64, edge: int, core: Box) -> Surfels:
-    """The second level of a tile: discs in its larger voxels in which no disc of the first stands.
+def _coarse(points: Int64, discs: Int64, edge: int, box: Box) -> tuple[Surfels, Int64]:
+    """The second level in a box: discs in the larger voxels in which no disc of the first stands;
+    and these voxels.
 
     Args:
         points: (n, 3) centroids of the first level's voxels that are no ghosts, also around the
             tile [mm].
-        discs: (m, 3) voxels of its discs, lexicographic.
-        edge: edge of its voxels [mm].
-        core: the tile.
+        discs: (m, 3) voxels of its discs.
+        edge: edge of the first level's voxels [mm].
+        box: where.
     """
     index, sums = cell_sums(points, COARSE * edge)
-    made = core.holds(index * COARSE * edge)
-    found = _of_voxels(thin(index, sums, COARSE * edge), index, COARSE * edge, made)
+    made = box.holds(index * COARSE * edge)
+    found = _of_voxels(thin(index, sums, COARSE * edge), index, COARSE * edge, made, touching=True)
     taken, _ = cell_sums(discs, COARSE)
-    bare = (
-        cell_of_points(index[made], 1, taken) < 0 if len(taken) else np.ones(len(found), np.bool_)
-    )
-    return found.where(found.flat & bare)
+    bare = cell_of_points(index[made], 1, taken) < 0
+    kept = np.logical_and(found.flat, bare)
+    return found.where(kept), index[made][kept]
+
+
+def _on(fine: Surfels, voxels: Int64, coarse: Surfels, of: Int64, edge: int) -> NDArray[np.bool_]:
+    """(n,) which balls of the first level lie on a disc of the second, which stands for them.
+
+    Args:
+        fine: the first level.
+        voxels: (n, 3) its voxels.
+        coarse: the second level.
+        of: (m, 3) its voxels, lexicographic.
+        edge: edge of the first level's voxels [mm].
+    """
+    row = cell_of_points(voxels, COARSE, of)
+    found = np.logical_and(row >= 0, ~fine.flat)
+    disc = row[found]
+    offset = (fine.centre_mm[found] - coarse.centre_mm[disc]).astype(np.float64)
+    normal = coarse.normal[disc] / NORMAL_ONE
+    away = (offset[:, 0] * normal[:, 0] + offset[:, 1] * normal[:, 1]) + offset[:, 2] * normal[:, 2]
+    found[found] = np.abs(away) <= 0.5 * edge
+    return found
 
 
 def _columns(store: TileStore, key: TileKey, surfels: Surfels) -> dict[str, NDArray[Any]]:

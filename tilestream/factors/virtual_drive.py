@@ -153,7 +153,7 @@ class Ends:
     """(k, 6) signed errors, `AXES` [m, rad]."""
 
 
-def drive(
+def ends_of(
     cells: Cells | LocalCells,
     points: Float64,
     T_map_lidar: Float64,

@@ -24,6 +24,10 @@ BALL = 0.5
 """Radius of a surfel that is not flat [edges]: 0.1 m."""
 LARGEST = 1.0
 """Largest radius of a surfel [edges]: 0.2 m."""
+TOUCH = 0.75
+"""Discs that are to touch reach this share of the distance from point to point …"""
+WIDEST = 1.5
+"""… and no farther than this [edges]."""
 CHUNK = 2**16
 """Surfels whose sums and axes are held at once: 20 MB."""
 NORMAL_ONE = 32767
@@ -88,9 +92,9 @@ def _covariances(sums: Int64) -> Float64:
 
 
 @njit(nogil=True, error_model="numpy")
-def _shape(points, sums, values, vectors, edge, centre, normal, radius):  # type: ignore[no-untyped-def]
+def _shape(points, sums, values, vectors, edge, touching, centre, normal, radius):  # type: ignore[no-untyped-def]
     """Write the disc or ball of each point, from the principal axes of the points around it;
-    lengths [mm].
+    lengths [mm]. Discs that are `touching` leave no gap where the points are sparse.
     """
     for i in range(len(sums)):
         middle, least = np.sqrt(values[i, 1]), np.sqrt(values[i, 2])
@@ -108,11 +112,15 @@ def _shape(points, sums, values, vectors, edge, centre, normal, radius):  # type
         for a in range(3):
             centre[i, a] = points[i, a] + np.rint(away * vectors[i, a, 2])
             normal[i, a] = np.rint(vectors[i, a, 2] * NORMAL_ONE)
-        radius[i] = np.rint(min(LARGEST * edge, 0.25 * edge + 0.6 * middle))
+        reach = min(LARGEST * edge, 0.25 * edge + 0.6 * middle)
+        if touching:
+            apart = REACH * edge * np.sqrt(np.pi / sums[i, 0])
+            reach = min(WIDEST * edge, max(reach, TOUCH * apart))
+        radius[i] = np.rint(reach)
 
 
 def surfels_of(
-    points_mm: Int64, index: Int64, edge_mm: int, own: NDArray[np.bool_]
+    points_mm: Int64, index: Int64, edge_mm: int, own: NDArray[np.bool_], touching: bool = False
 ) -> tuple[Int64, NDArray[np.int16], NDArray[np.int32]]:
     """The surfels of voxels: their points' plane within 2.25 edges, or a ball.
 
@@ -123,6 +131,7 @@ def surfels_of(
         index: (n, 3) voxels, lexicographic.
         edge_mm: edge of a voxel [mm].
         own: (n,) the voxels whose surfels are wanted; the others only contribute points.
+        touching: whether discs are as large as the distance from point to point asks for.
 
     Returns:
         Of the wanted voxels, in their order: (m, 3) centres [mm, map frame]; (m, 3) unit normals,
@@ -145,5 +154,6 @@ def surfels_of(
         sums = np.zeros((len(some), 10), np.int64)
         _neighbour_sums(points_mm, column, first, rows, int(REACH * edge_mm), some, sums)
         axes = eigen(_covariances(sums))
-        _shape(points_mm[some], sums, *axes, edge_mm, centre[part], normal[part], radius[part])
+        out = centre[part], normal[part], radius[part]
+        _shape(points_mm[some], sums, *axes, edge_mm, touching, *out)
     return centre, normal, radius
