@@ -153,7 +153,7 @@ def test_every_label_is_that_of_localization_error(
         )
         for name in ("error_mean", "p_fail", "mean_held", "median_held", "p95_held"):
             np.testing.assert_array_equal(row[name], getattr(expected, name))  # NaN: all failed
-        for name in ("along", "across", "up", "yaw"):
+        for name in ("along", "across", "up", "roll", "pitch", "yaw"):
             assert row[f"{name}_mean"] == getattr(expected, f"{name}_mean")
         assert (row["error_floor"], row["error_tail"]) == (
             expected.error_floor,
@@ -165,7 +165,8 @@ def test_every_label_is_that_of_localization_error(
         assert row["starts"] == 13
         assert row["points"] == expected.registrations.points
         mine = starts[starts["sample"] == row["sample"]]
-        for name in ("along", "across", "up", "yaw", "error", "converged", "iterations"):
+        axes = ("along", "across", "up", "roll", "pitch", "yaw_vector", "yaw")
+        for name in (*axes, "error", "converged", "iterations"):
             np.testing.assert_array_equal(mine[name], getattr(expected, name))
         for name in ("score", "nvtl", "hits"):
             np.testing.assert_array_equal(mine[name], getattr(expected.registrations, name))

@@ -41,6 +41,8 @@ ERROR_COLUMNS = (
     Column("along_mean", "label", "m", "Mean of abs(along).", ""),
     Column("across_mean", "label", "m", "Mean of abs(across).", ""),
     Column("up_mean", "label", "m", "Mean of abs(up).", ""),
+    Column("roll_mean", "label", "rad", "Mean of abs(roll).", ""),
+    Column("pitch_mean", "label", "rad", "Mean of abs(pitch).", ""),
     Column("yaw_mean", "label", "rad", "Mean of abs(yaw).", ""),
     Column(
         "error_floor",
@@ -63,7 +65,7 @@ BYTES_PER_ROW = 600
 
 @stage(
     "label",
-    version=3,
+    version=4,
     memory=lambda counts: FIXED_BYTES + BYTES_PER_ROW * counts["rows"],
     seconds=0.006,
     columns=ERROR_COLUMNS,
@@ -111,7 +113,7 @@ def _row(
 def _summed(starts: pd.DataFrame) -> dict[str, float]:
     """The label of one sample point from the rows of its starts."""
     starts = starts.sort_values("start")
-    names = ("along", "across", "up", "yaw", "error")
+    names = ("along", "across", "up", "roll", "pitch", "yaw", "error")
     errors = {name: starts[name].to_numpy() for name in names}
     return {
         "starts": len(starts),

@@ -31,6 +31,8 @@ FIXED_BYTES = 300_000_000
 BYTES_PER_POINT = 30
 """Memory per map point in sight of the slice, of which the cells are held twice."""
 
+ROTATION = "component of w, Exp(w) = R_final R_true^T"
+"""What the components of a rotation error are of."""
 SCAN_COLUMNS = (
     Column(
         "sample", "place", "1", "Number of the sample point along the drive.", "", dtype="int64"
@@ -49,6 +51,9 @@ START_COLUMNS = (
     ),
     Column("across", "label", "m", "Error across the true heading, left positive.", "final - true"),
     Column("up", "label", "m", "Error in map z.", "final - true"),
+    Column("roll", "label", "rad", "Rotation error along the true heading.", ROTATION),
+    Column("pitch", "label", "rad", "Rotation error across the true heading.", ROTATION),
+    Column("yaw_vector", "label", "rad", "Rotation error in map z.", ROTATION),
     Column("yaw", "label", "rad", "Error of the heading, in [-pi, pi).", "final - true"),
     Column("error", "label", "m", "3D error.", "norm of along, across, up"),
     Column("converged", "label", "1", "Whether the last step was below epsilon.", "", dtype="bool"),
@@ -85,7 +90,7 @@ class Measuring:
 
 @stage(
     "register",
-    version=3,
+    version=4,
     memory=lambda counts: FIXED_BYTES + BYTES_PER_POINT * counts["points"],
     seconds=0.45,
     columns=START_COLUMNS,
