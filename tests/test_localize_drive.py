@@ -21,7 +21,7 @@ from tilestream.errors import PoseError, TileNotReadyError, UsageError
 from tilestream.formats.logs import open_log
 from tilestream.formats.logs.degrade import degraded
 from tilestream.formats.points.pcd import write_pcd
-from tilestream.label import refined_pose, start_poses
+from tilestream.label import refined_pose, start_errors, start_poses
 from tilestream.marks import Mark
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.jobs.localize import REACH, choose_samples
@@ -30,6 +30,7 @@ from tilestream.pipeline.stages.drive_scans import Reading
 from tilestream.pipeline.stages.label import ERROR_COLUMNS
 from tilestream.pipeline.stages.register import START_COLUMNS
 from tilestream.records import Cells
+from tilestream.report.log_poses import note_of_log_poses
 from tilestream.settings import StartSettings
 from tilestream.store import POINTS, Tile
 from tilestream.tables import read_mark, read_tables
@@ -214,6 +215,17 @@ def test_a_refined_true_pose_is_recorded_and_used(
         T = refined_pose(fine, scan.points, scan.T_map_lidar)
         assert (row.x, row.y, row.z) == tuple(T[:3, 3])
         assert (row.x, row.y) != tuple(scan.T_map_lidar[:2, 3])
+        off = start_errors(T, scan.T_map_lidar[None])
+        for name in ("along", "across", "up", "yaw"):
+            assert getattr(row, f"log_{name}") == off[name][0]
+    (told,) = note_of_log_poses(labels)
+    far = np.linalg.norm(labels[["log_along", "log_across", "log_up"]], axis=1)
+    assert f"are {100 * np.median(far):.1f} cm from the refined ones (median of 2 scans" in told
+    assert f"{100 * labels['log_across'].median():+.1f} cm across" in told
+    own = plain[0].filter(regex="^log_")
+    assert own.shape[1] == 4
+    assert own.isna().all(axis=None)
+    assert note_of_log_poses(plain[0]) == []
 
 
 def test_one_scan_is_chosen_per_metre_of_the_drive(tmp_path: Path) -> None:

@@ -35,6 +35,7 @@ from tilestream.pipeline.stages.factors import Looking
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.report import write_comparison
 from tilestream.report.drives import EVALUATED, DriveMeasured
+from tilestream.report.log_poses import note_of_log_poses
 from tilestream.report.segments import check_threshold
 from tilestream.sensor import SENSORS, sensor_of
 from tilestream.settings import (
@@ -129,6 +130,9 @@ def localize(
             allow_overlap=labels.allow_overlap,
         )
     measured = drive_measured(drive.log, log, how["scans"], places.spacing, found)
+    off = {drive.log: note_of_log_poses(found)}
+    say_notes(off)
+    notes = noticed(notes, off)
     if as_json:
         told = {"matcher": registration.told, "drive": measured.plain(), "notes": notes}
         print_json({**told, **error_facts(found)})

@@ -49,6 +49,7 @@ from tilestream.pipeline.jobs.run_inputs import (
 )
 from tilestream.pipeline.jobs.run_notes import (
     drives_measured,
+    log_poses_told,
     lost_labels,
     run_notes,
     with_logs,
@@ -287,7 +288,8 @@ def _report(settings: RunSettings, inputs: Inputs, story: _Story, book: Book) ->
     book.facts["drives"] = [drive.plain() for drive in measured]
     if not done.outputs("factors"):
         return
-    book.facts["notes"] = noticed(book.facts["notes"], heights_told(done, settings))
+    told = (heights_told(done, settings), log_poses_told(done))
+    book.facts["notes"] = noticed(book.facts["notes"], *told)
     known = done.dataset()
     if known is not None:
         book.facts |= {"labelled": len(known), "lost_labels": known.losses}

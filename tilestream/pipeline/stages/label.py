@@ -12,6 +12,8 @@ from tilestream.pipeline.stages.drive_scans import Sample
 from tilestream.pipeline.stages.register import SCAN_COLUMNS
 from tilestream.records import Column
 
+OFF_LOG = "log - refined; NaN where the true pose is the log's"
+"""What the offsets of the log's poses are."""
 ERROR_COLUMNS = (
     *SCAN_COLUMNS,
     Column("x", "place", "m", "True position of the lidar in the map.", "see true_pose"),
@@ -22,6 +24,10 @@ ERROR_COLUMNS = (
     Column("arc_length", "place", "m", "Length of the drive up to here.", "of the log's poses"),
     Column("true_pose", "label", "", "log or refined.", "definitions, section 5", dtype="str"),
     Column("as_sensor", "label", "", "As if by which sensor the log was read.", "", dtype="str"),
+    Column("log_along", "place", "m", "Of the log's pose along the true heading.", OFF_LOG),
+    Column("log_across", "place", "m", "Of the log's pose across it, left positive.", OFF_LOG),
+    Column("log_up", "place", "m", "Of the log's pose in map z.", OFF_LOG),
+    Column("log_yaw", "place", "rad", "Of the log's heading, in [-pi, pi).", OFF_LOG),
     Column("points", "label", "1", "Scan points that were registered, thinned.", "", dtype="int64"),
     Column("starts", "label", "1", "Number of starts.", "", dtype="int64"),
     Column("converged", "label", "1", "Share of starts that converged.", ""),

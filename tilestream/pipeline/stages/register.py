@@ -66,6 +66,10 @@ START_COLUMNS = (
 )
 
 
+OF_LOG = ("along", "across", "up", "yaw")
+"""What is kept of how far the log's pose is from a refined one."""
+
+
 @dataclass(frozen=True)
 class Measuring:
     """What an error is measured with: the identity of a data set of labels."""
@@ -122,7 +126,7 @@ def register(
         else:
             which = {"sample": sample.number, "scan": sample.scan, "stamp_ns": scan.stamp_ns}
             rows.append(found.assign(**which))
-            place |= _place(T_map_true)
+            place |= _place(T_map_true) | _off_log(scan, T_map_true, measuring)
             facts[str(sample.number)] = place | {"points": points, "reason": ""}
     names = {column.name: column.dtype for column in START_COLUMNS}
     frame = pd.concat(rows, ignore_index=True)[list(names)].astype(names)
@@ -155,6 +159,15 @@ def _place(T_map_true: Float64 | None) -> dict[str, float]:
     assert T_map_true is not None  # a drive's scans have a pose
     x, y, z = T_map_true[:3, 3].tolist()
     return {"x": x, "y": y, "z": z, "heading": math.atan2(T_map_true[1, 0], T_map_true[0, 0])}
+
+
+def _off_log(scan: Scan, T_map_true: Float64, measuring: Measuring) -> dict[str, float]:
+    """How far the log's pose is from a refined true pose, in its frame; else nothing."""
+    if measuring.true_pose == "log":
+        return {}
+    assert scan.T_map_lidar is not None  # a drive's scans have a pose
+    off = start_errors(T_map_true, scan.T_map_lidar[None])
+    return {f"log_{name}": float(off[name][0]) for name in OF_LOG}
 
 
 def _lidar_heights(map_part: MapPart, scans: OpenedScans) -> list[float | None]:
