@@ -74,6 +74,8 @@ class Findings:
     """How much of each drive was measured."""
     lost_labels: Sequence[Mapping[str, Any]] = ()
     """The labels that no model can learn from: `reason`, `count`, `detail`."""
+    cell_size: float | None = None
+    """Edge of the cells that labels were measured with [m]; None: not known."""
     crs: str | None = None
     """CRS of x and y, anything that pyproj reads; None: a local frame."""
     around: Around | None = None

@@ -13,6 +13,7 @@ from tilestream.records import Float64, Int64
 from tilestream.report.data import PLACE_COLUMNS, Findings, estimates, like_training
 from tilestream.report.formatting import cm, distance, known, percent, thousands
 from tilestream.report.lines import held_out_along, interval_factor
+from tilestream.report.paper_tables import paper_table_i, paper_table_iii, table_i, table_iii
 from tilestream.report.segments import reaches, segments, worst_places
 from tilestream.version import VERSION
 
@@ -40,6 +41,10 @@ def summary(found: Findings, threshold: float) -> dict[str, Any]:
         "segments": [segment(found.places, rows) for rows in runs],
         "worst": [place(found.places, row) for row in worst_places(found.places)],
         "paths": paths(found),
+        "table_i": table_i(found.labels),
+        "paper_table_i": paper_table_i(),
+        "table_iii": table_iii(found.labels, found.cell_size),
+        "paper_table_iii": paper_table_iii(),
         "protocols": found.protocols.to_dict("records"),
         "table_iv": found.table_iv.to_dict("records"),
         "paper_table_iv": PAPER_TABLE.to_dict("records"),

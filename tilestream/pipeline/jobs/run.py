@@ -302,7 +302,11 @@ def _report(settings: RunSettings, inputs: Inputs, story: _Story, book: Book) ->
         seen_otherwise(settings, inputs.drives),
     )
     found = replace(
-        found, notes=book.facts["notes"], drives=measured, lost_labels=lost_labels(known)
+        found,
+        notes=book.facts["notes"],
+        drives=measured,
+        lost_labels=lost_labels(known),
+        cell_size=settings.cell_size,
     )
     text = json.dumps(plain(evaluation), indent=1, allow_nan=False)
     write_text(settings.folder.under("tables/evaluation.json"), text + "\n")
