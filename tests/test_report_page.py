@@ -69,7 +69,7 @@ def text_of(page: Path | Findings, section: str) -> str:
 def rendered(found: Findings) -> str:
     """The page alone, without pictures of the worst places."""
     content = summary(found, LIMIT)
-    return report_page(found, content, dict.fromkeys(range(1, 11), "not taken"))
+    return report_page(found, content, dict.fromkeys(range(1, 11), "not taken"), "not drawn")
 
 
 @pytest.mark.parametrize("name", ["whole", "without_labels", "one_place", "nothing_estimated"])
@@ -80,7 +80,7 @@ def test_every_section_is_there_in_order_and_says_something(
     source = path.read_text(encoding="utf-8")
     there = re.findall(r'<section id="([^"]+)">', source)
     assert there == re.findall(r'<a href="#([^"]+)">', source)
-    assert len(there) == 12
+    assert len(there) == 13
     for section in there:
         assert len(text_of(path, section)) > 80, section
 
@@ -90,6 +90,7 @@ def test_what_is_empty_says_why(others: dict[str, Path]) -> None:
     for section, why in (
         ("worst", "made without the map"),
         ("paths", "No place was labelled"),
+        ("ends", "No picture: no place was labelled"),
         ("table-i", "the paper's own figures stand alone"),
         ("table-iii", "the paper's own paths stand alone"),
         ("importances", "No forest was trained"),
@@ -217,7 +218,7 @@ def test_the_worst_places_are_told_in_words_and_pictures(found: Findings, page: 
         start = f"{number} {place['route_id']} , {place['arc_length']:.0f} m along"
         assert start in text
         assert cm(place["estimate"]).replace("\u00a0", " ") in text
-    assert page.read_text().count('src="data:image/png;base64,') == 10
+    assert page.read_text().count('src="data:image/png;base64,') == 10 + 1  # the ends
 
 
 def test_table_iv_stands_beside_the_papers_and_names_the_leak(page: Path) -> None:
@@ -421,7 +422,7 @@ def test_a_browser_shows_what_lacks_something(
     browser: Page, others: dict[str, Path], name: str
 ) -> None:
     tab = opened(browser, others[name])
-    assert tab.evaluate("document.querySelectorAll('section').length") == 12
+    assert tab.evaluate("document.querySelectorAll('section').length") == 13
     calm(tab)
 
 

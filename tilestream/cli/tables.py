@@ -12,6 +12,7 @@ from tilestream.apps.diff import MapDiff
 from tilestream.apps.info import Info
 from tilestream.crs import named
 from tilestream.factors.catalogue import COLUMNS
+from tilestream.label import FAILED
 from tilestream.pipeline.engine.costs import core_hours
 from tilestream.pipeline.engine.plan import Plan, megabytes
 from tilestream.pipeline.jobs.forecast import Forecast
@@ -108,6 +109,24 @@ def info_table(found: Info) -> Table:
         table.add_row("holds", line)
     for note in found.notes:
         table.add_row("note", note)
+    return table
+
+
+ENDS = ("from_along", "from_across", "along", "across", "up", "error")
+"""What is told of each start [m]."""
+
+
+def ends_table(rows: pd.DataFrame) -> Table:
+    """Where the starts of a place began and ended, a line per start."""
+    failed = int((rows["error"] > FAILED).sum())
+    title = f"{len(rows)} starts of sample point {rows['sample'].iloc[0]}, {failed} failed"
+    table = Table(title=title, title_justify="left", box=SIMPLE)
+    for name in ("scan", "start", *(f"{name} [m]" for name in ENDS), "converged"):
+        table.add_column(name, justify="right")
+    for row in rows.to_dict("records"):
+        lengths = (f"{row[name]:.3f}" for name in ENDS)
+        converged = "yes" if row["converged"] else "no"
+        table.add_row(str(row["scan"]), str(row["start"]), *lengths, converged)
     return table
 
 

@@ -56,6 +56,7 @@ from tilestream.pipeline.jobs.run_notes import (
 )
 from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
 from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
+from tilestream.pipeline.jobs.starts_of import starts_of
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.samples import DatasetFile
 from tilestream.report import write_report
@@ -307,6 +308,7 @@ def _report(settings: RunSettings, inputs: Inputs, story: _Story, book: Book) ->
         drives=measured,
         lost_labels=lost_labels(known),
         cell_size=settings.cell_size,
+        ends=lambda group, sample: starts_of(settings.out, sample, group),
     )
     text = json.dumps(plain(evaluation), indent=1, allow_nan=False)
     write_text(settings.folder.under("tables/evaluation.json"), text + "\n")
