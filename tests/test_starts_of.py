@@ -79,7 +79,7 @@ def test_the_starts_of_a_place_are_those_of_the_table_with_where_they_were(table
 def test_a_place_that_was_not_measured_says_why(tables: Path, tmp_path: Path) -> None:
     with pytest.raises(SourceNotFoundError, match=r"sample 2 has no ends: .*points"):
         ts.starts_of(tables, 2)
-    with pytest.raises(SourceNotFoundError, match="no sample 7"):
+    with pytest.raises(SourceNotFoundError, match="sample 7 is not among the labels"):
         ts.starts_of(tables, 7)
     with pytest.raises(SourceNotFoundError, match="no drive was localized"):
         ts.starts_of(tmp_path, 0)

@@ -70,7 +70,9 @@ def localize(
     folder: Annotated[str, typer.Option("--out", help="Folder of the tables.")],
     which_map: Annotated[MapSettings, fields("partial")],
     places: Annotated[PlaceSettings, fields("cell_size", "spacing", "memory")],
-    labels: Annotated[LabelSettings, fields("matcher", "true_pose", "allow_overlap")],
+    labels: Annotated[
+        LabelSettings, fields("matcher", "true_pose", "scans_per_point", "allow_overlap")
+    ],
     leaf: Annotated[RegistrationSettings, fields("scan_leaf")],
     starts: Annotated[StartSettings, fields("radius", "step")],
     drive: Annotated[
@@ -96,13 +98,17 @@ def localize(
         "registration": registration,
         "starts": starts,
         "true_pose": labels.true_pose,
+        "scans_per_point": labels.scans_per_point,
         "scans": scans_of(drive),
         "starts_per_task": starts_per_task,
         "memory": places.memory,
     }
     opened, reading = open_store(store), reading_of(drive)
     log = opened_log(reading)
-    shared = localize_drive.drive_overlap(reading, how["scans"], places.spacing, opened.sources())
+    several = labels.scans_per_point
+    shared = localize_drive.drive_overlap(
+        reading, how["scans"], places.spacing, opened.sources(), several
+    )
     of_drive = {drive.log: [*log.notes, *shared.notes], MATCHER: registration.notes}
     notes = noticed(map_notes(opened), of_drive)
     say_notes(notes)
@@ -129,7 +135,7 @@ def localize(
             partial=which_map.partial,
             allow_overlap=labels.allow_overlap,
         )
-    measured = drive_measured(drive.log, log, how["scans"], places.spacing, found)
+    measured = drive_measured(drive.log, log, how["scans"], places.spacing, found, several)
     off = {drive.log: note_of_log_poses(found)}
     say_notes(off)
     notes = noticed(notes, off)

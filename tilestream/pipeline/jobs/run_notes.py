@@ -51,14 +51,16 @@ def with_logs(
     found = []
     for drive in inputs.drives:
         reading, scans, spacing = reading_of(drive), scans_of(drive), settings.spacing
+        several = settings.label.scans_per_point
         try:
-            log, shared = opened(reading), drive_overlap(reading, scans, spacing, sources)
+            log = opened(reading)
+            shared = drive_overlap(reading, scans, spacing, sources, several)
         except (SourceError, OSError):  # it is left out, see `plan_measure`
             continue
         if not settings.label.allow_overlap:
             shared.require_none()
         notes.append({drive.log: [*log.notes, *shared.notes]})
-        found.append(to_measure(drive.group, log, scans, spacing))
+        found.append(to_measure(drive.group, log, scans, spacing, several))
     return replace(inputs, notes=noticed(inputs.notes, *notes), to_measure=tuple(found))
 
 

@@ -37,7 +37,7 @@ def starts_of(place: str | os.PathLike[str], sample: int, drive: str = "") -> pd
             where there is one.
 
     Returns:
-        A row per start, by number: the columns of the table `starts`, and where it was:
+        A row per start, by scan and number: the columns of the table `starts`, and where it was:
         `from_along`, `from_across`, `from_up` [m], `from_yaw` [rad].
 
     Raises:
@@ -48,18 +48,21 @@ def starts_of(place: str | os.PathLike[str], sample: int, drive: str = "") -> pd
         DamagedError: a table is not what was written.
     """
     folder = _folder(place, drive)
-    wanted, parts = str(sample), []
+    parts: list[pd.DataFrame] = []
+    failed: dict[int, str] = {}
     for path in tables_in(folder):
         facts = read_mark(path).facts
-        if wanted not in facts["samples"]:
-            continue
-        fact = facts["samples"][wanted]
-        if fact["reason"]:
-            raise SourceNotFoundError(f"{folder}: sample {sample} has no ends: {fact['reason']}")
-        rows = read_tables([path])
-        parts.append(_with_places(rows[rows["sample"] == sample], fact, facts["data_set"]))
+        scans = {int(scan): of for scan, of in facts["scans"].items() if of["sample"] == sample}
+        rows = read_tables([path]) if scans else pd.DataFrame()
+        for scan, of in scans.items():
+            if of["reason"]:
+                failed[scan] = of["reason"]
+            else:
+                parts.append(_with_places(rows[rows["scan"] == scan], of, facts["data_set"]))
+    parts = [rows for rows in parts if rows["scan"].iloc[0] not in failed]
     if not parts:
-        raise SourceNotFoundError(f"{folder}: no sample {sample}; the table `errors` has them all")
+        why = next((f"has no ends: {why}" for why in failed.values()), "is not among the labels")
+        raise SourceNotFoundError(f"{folder}: sample {sample} {why}")
     found = pd.concat(parts).sort_values(["scan", "start"], ignore_index=True)
     return found[[column.name for column in ENDS_COLUMNS]]
 

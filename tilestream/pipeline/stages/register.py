@@ -84,6 +84,8 @@ class Measuring:
     """The starts."""
     as_sensor: str
     """As if by which sensor the log was read."""
+    scans_per_point: int = 1
+    """Scans of a sample point, at most."""
 
     @property
     def cell_sizes(self) -> tuple[float, ...]:
@@ -111,10 +113,10 @@ def register(
         batch: first and last (exclusive) start.
     """
     rows: list[pd.DataFrame] = [NO_ROWS]
-    facts: dict[str, dict[str, Any]] = {}
+    facts: dict[str, dict[str, Any]] = {}  # by the number of the scan
     heights = _lidar_heights(map_part, scans)
     for (sample, scan), height in zip(scans, heights, strict=True):
-        place: dict[str, float | None] = {"lidar_height": height}
+        place: dict[str, float | None] = {"sample": sample.number, "lidar_height": height}
         if measuring.true_pose == "log":
             place |= _place(scan.T_map_lidar)
         try:
@@ -122,16 +124,16 @@ def register(
             T_map_true = _true_pose(map_part, seen, measuring)
             found, points = _registered(map_part, seen, T_map_true, measuring, batch)
         except (RegistrationError, PoseError, UsageError, TileNotReadyError) as error:
-            facts[str(sample.number)] = place | {"reason": str(error)}
+            facts[str(sample.scan)] = place | {"reason": str(error)}
         else:
             which = {"sample": sample.number, "scan": sample.scan, "stamp_ns": scan.stamp_ns}
             rows.append(found.assign(**which))
             place |= _place(T_map_true) | _off_log(scan, T_map_true, measuring)
-            facts[str(sample.number)] = place | {"points": points, "reason": ""}
+            facts[str(sample.scan)] = place | {"points": points, "reason": ""}
     names = {column.name: column.dtype for column in START_COLUMNS}
     frame = pd.concat(rows, ignore_index=True)[list(names)].astype(names)
     known = {"data_set": canonical(measuring), "store": map_part.store.address}
-    return Made(frame, {**known, "samples": facts})
+    return Made(frame, {**known, "scans": facts})
 
 
 def _registered(
