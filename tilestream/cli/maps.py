@@ -165,12 +165,12 @@ def info(
             "of a drive began and ended."
         ),
     ] = None,
-    drive: Annotated[str, typer.Option(help="Which drive, where a run has several.")] = "",
+    of_drive: Annotated[str, typer.Option(help="Its drive, where a run has several.")] = "",
     as_json: AsJson = False,
 ) -> None:
     """Show what is in anything that is read or made: extent, CRS, coverage, state, notes."""
     if starts_of is not None:
-        rows = ends_of(file, starts_of, drive)
+        rows = ends_of(file, starts_of, of_drive)
         if as_json:
             print_json(rows.to_dict("records"))
         else:

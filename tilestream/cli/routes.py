@@ -55,6 +55,13 @@ Ranges = Annotated[
     list[str],
     typer.Option("--range-max", "--range", help="Usable ranges [m], e.g. 30,60; default: all."),
 ]
+Leaves = Annotated[
+    list[str],
+    typer.Option(
+        "--scan-leaf",
+        help="Leaves that scans are thinned by [m], e.g. 0.5,2.0; default: the matcher's.",
+    ),
+]
 BlindRears = Annotated[
     list[str],
     typer.Option(
@@ -258,6 +265,7 @@ def compare(
     ] = ["2.0"],  # noqa: B006
     ranges: Ranges = [],  # noqa: B006
     blind_rear: BlindRears = ["0"],  # noqa: B006
+    leaves: Leaves = [],  # noqa: B006
     cap: Annotated[
         float, typer.Option(help="What 95 % of a tile's estimates must stay within [m].")
     ] = 0.15,
@@ -265,7 +273,7 @@ def compare(
     as_json: AsJson = False,
     cluster: Cluster = HERE,
 ) -> None:
-    """Compare lidars, ranges and map resolutions along routes, from the map alone."""
+    """Compare lidars, ranges, resolutions of map and scan along routes, from the map alone."""
     for limit in (report.threshold, cap):
         check_threshold(limit)
     opened = open_store(store)
@@ -280,6 +288,7 @@ def compare(
             numbers(ranges, "--range-max") or (None,),
             numbers(blind_rear, "--blind-rear-deg"),
             numbers(cell_size, "--cell-size") if own is None else [own],
+            numbers(leaves, "--scan-leaf") or (None,),
         )
         registration = registration.model_copy(update={"resolution": None})
         height, z = places.sensor_height, places.route_z
