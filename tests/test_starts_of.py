@@ -3,6 +3,7 @@
 import json
 import math
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import logs
@@ -16,13 +17,14 @@ from scenes import scene
 
 import tilestream as ts
 from tilestream.cli import run
-from tilestream.errors import SourceNotFoundError, UsageError
+from tilestream.errors import SourceNotFoundError, StoreError, UsageError
 from tilestream.formats.points.pcd import write_pcd
+from tilestream.pipeline.stages.register import START_COLUMNS
 from tilestream.report import write_report
 from tilestream.report.ends import ends_figure
 from tilestream.report.segments import APART, MEASURED, worst_measured
 from tilestream.settings import StartSettings
-from tilestream.tables import read_tables
+from tilestream.tables import read_mark, read_tables, write_table
 
 HOW = StartSettings(radius=0.4, step=0.2, yaw=(-0.02, 0.02), z=(0.0, 0.1))
 STARTS = 13 * 4
@@ -85,6 +87,18 @@ def test_a_place_that_was_not_measured_says_why(tables: Path, tmp_path: Path) ->
         ts.starts_of(tmp_path, 0)
     with pytest.raises(UsageError, match="no drive 'noon'"):
         ts.starts_of(tables, 0, "noon")
+
+
+def test_tables_of_an_older_version_are_refused_by_name(tables: Path, tmp_path: Path) -> None:
+    old = tmp_path / "starts"
+    shutil.copytree(tables / "starts", old)
+    (first, *_) = sorted(old.glob("*.parquet"))
+    mark = read_mark(str(first))
+    facts = {"samples" if name == "scans" else name: fact for name, fact in mark.facts.items()}
+    rows = read_tables([str(first)])
+    write_table(str(first), rows, START_COLUMNS, replace(mark, facts=facts))
+    with pytest.raises(StoreError, match=rf"{first.name} is of an older version"):
+        ts.starts_of(tmp_path, 0)
 
 
 def test_of_several_drives_one_is_named(tables: Path, tmp_path: Path) -> None:

@@ -16,6 +16,8 @@ from tilestream.records import Float64
 from tilestream.report.colours import ACTUAL, palette
 from tilestream.report.formatting import CM_PER_M
 
+IN_A_ROW = 3
+"""Places beside each other."""
 FARTHEST = 3.0
 """How far from the true position an end is drawn at most [m]; those beyond are counted."""
 NEAREST = 0.6
@@ -28,7 +30,7 @@ REPEATED = 1e-6
 
 
 def ends_figure(places: Sequence[tuple[str, pd.DataFrame]]) -> Figure:
-    """Where the starts of places were and where they ended, a column for each place.
+    """Where the starts of places were and where they ended, `IN_A_ROW` places beside each other.
 
     Above, each start as a square of the lattice of starts, coloured by the error that it ends with;
     below, where it ended. Starts that fail are black. Along the true heading is to the right, left
@@ -37,16 +39,32 @@ def ends_figure(places: Sequence[tuple[str, pd.DataFrame]]) -> Figure:
     Args:
         places: what to call each place, and its starts (`starts_of`).
     """
-    figure = Figure(figsize=(2.6 * len(places) + 0.9, 5.6), layout="constrained")
-    panels = figure.subplots(2, len(places), squeeze=False)
-    for (title, rows), (above, below) in zip(places, panels.T, strict=True):
-        _draw_starts(above, rows)
-        _draw_ends(below, rows)
+    wide = min(len(places), IN_A_ROW)
+    rows = -(-len(places) // wide)
+    figure = Figure(figsize=(2.6 * wide + 0.9, 5.6 * rows), layout="constrained")
+    panels = figure.subplots(2 * rows, wide, squeeze=False)
+    for number in range(rows * wide):
+        row, column = divmod(number, wide)
+        above, below = panels[2 * row : 2 * row + 2, column]
+        if number >= len(places):
+            above.remove()
+            below.remove()
+            continue
+        title, starts = places[number]
+        _draw_starts(above, starts)
+        _draw_ends(below, starts)
         above.set_title(title, fontsize=9, parse_math=False)
         below.set_xlabel("along [m]", fontsize=8)
-    panels[0, 0].set_ylabel("starts, across [m]", fontsize=8)
-    panels[1, 0].set_ylabel("ends, across [m]", fontsize=8)
-    bar = panels[0, -1].inset_axes((1.06, 0.0, 0.06, 1.0))
+        if column == 0:
+            above.set_ylabel("starts, across [m]", fontsize=8)
+            below.set_ylabel("ends, across [m]", fontsize=8)
+    _colour_bar(panels[0, -1])
+    return figure
+
+
+def _colour_bar(axes: Axes) -> None:
+    """What the colours mean, right of a panel."""
+    bar = axes.inset_axes((1.06, 0.0, 0.06, 1.0))
     ramp = np.linspace(0.0, 1.0, COLOURS.N)[:, None]
     bar.imshow(ramp, origin="lower", aspect="auto", cmap=COLOURS,
                extent=(0.0, 1.0, 0.0, FAILED * CM_PER_M))  # fmt: skip
@@ -55,7 +73,6 @@ def ends_figure(places: Sequence[tuple[str, pd.DataFrame]]) -> Figure:
     bar.yaxis.set_label_position("right")
     bar.yaxis.tick_right()
     bar.tick_params(labelsize=7)
-    return figure
 
 
 def _draw_starts(axes: Axes, rows: pd.DataFrame) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from tilestream.errors import SourceNotFoundError, UsageError
+from tilestream.errors import SourceNotFoundError, StoreError, UsageError
 from tilestream.files import Files
 from tilestream.label import start_errors, start_poses
 from tilestream.pipeline.jobs.inventory import tables_in
@@ -44,6 +44,7 @@ def starts_of(place: str | os.PathLike[str], sample: int, drive: str = "") -> pd
         UsageError: several drives and none is named, or none of that name.
         SourceNotFoundError: no tables there, no such sample point, or one that was not measured:
             says why.
+        StoreError: tables of an older version.
         IncompleteError: the job that makes the tables has not ended.
         DamagedError: a table is not what was written.
     """
@@ -52,6 +53,10 @@ def starts_of(place: str | os.PathLike[str], sample: int, drive: str = "") -> pd
     failed: dict[int, str] = {}
     for path in tables_in(folder):
         facts = read_mark(path).facts
+        if "scans" not in facts:
+            raise StoreError(
+                f"{path} is of an older version of tilestream: run the job that makes it again"
+            )
         scans = {int(scan): of for scan, of in facts["scans"].items() if of["sample"] == sample}
         rows = read_tables([path]) if scans else pd.DataFrame()
         for scan, of in scans.items():
