@@ -26,7 +26,7 @@ import json
 from typing import Any
 
 import pandas as pd
-from shinjuku_labels import LIMITS, PAPER
+from shinjuku_labels import TABLE_ONE, markdown, table_one
 
 import tilestream as ts
 from tilestream.model.evaluation import PAPER_TABLE
@@ -42,28 +42,13 @@ TITLES = {protocol.name: protocol.name for protocol in PROTOCOLS} | {
 }
 
 
-def markdown(rows: list[list[str]], head: list[str]) -> str:
-    """A Markdown table."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
-def table_one(run_dir: Path) -> str:
+def table_one_by_drive(run_dir: Path) -> str:
     """Shares of sample points beyond each limit, ours and the paper's, by drive."""
     rows = ts.dataset(run_dir).rows
     lines = []
     for drive, part in rows.assign(drive=rows["group"].str.split("-").str[0]).groupby("drive"):
-        paths = dict(tuple(part.groupby("path"))) | {"all": part}
-        for name, points in paths.items():
-            error, paper = points["error_mean"], PAPER.get(str(name), ("",) * 4)
-            shares = [
-                f"{CM * (error > limit).mean():.1f}, {of_paper}"
-                for limit, of_paper in zip(LIMITS, paper, strict=True)
-            ]
-            middle = f"{CM * error.median():.1f}"
-            lines.append([str(drive), str(name), str(len(points)), middle, *shares])
-    head = ["drive", "path", "points", "median", "> 10 cm, paper", "> 15", "> 20", "> 25"]
-    return markdown(lines, head)
+        lines += [[str(drive), *row] for row in table_one(part)]
+    return markdown(lines, ["drive", *TABLE_ONE])
 
 
 def figures(row: Any) -> list[str]:
@@ -143,7 +128,7 @@ def main(given: argparse.Namespace) -> None:
     """Print the tables of a run directory."""
     evaluation = json.loads((given.run_dir / "tables" / "evaluation.json").read_text())
     run = json.loads((given.run_dir / "run.json").read_text())
-    print(f"## Errors\n\n{table_one(given.run_dir)}\n")
+    print(f"## Errors\n\n{table_one_by_drive(given.run_dir)}\n")
     print(f"## Table IV\n\n{table_four(evaluation)}\n")
     print(f"## Protocols\n\n{table_protocols(evaluation)}\n")
     for target in dict.fromkeys(row["target"] for row in evaluation["parts"]):

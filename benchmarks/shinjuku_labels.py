@@ -50,21 +50,14 @@ from tilestream.pipeline.engine.cluster import dask_client
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY
 from tilestream.pipeline.jobs.simulate import SMALL_POINTS, simulate
 from tilestream.records import Float64
+from tilestream.report.paper_tables import LIMITS, paper_table_i, table_i
 from tilestream.simulation.city import build_city
 from tilestream.simulation.drive import scans
 from tilestream.simulation.settings import SimulationSettings, load_preset
 from tilestream.simulation.streets import Street
 
-LIMITS = (0.10, 0.15, 0.20, 0.25)
-PAPER = {
-    "I": (28.9, 11.1, 4.3, 2.2),
-    "II": (40.8, 17.9, 7.3, 1.9),
-    "III": (27.6, 23.2, 20.7, 17.9),
-    "IV": (18.7, 8.4, 4.12, 1.9),
-    "V": (86.0, 33.4, 15.0, 7.0),
-    "all": (41.9, 17.8, 8.45, 4.31),
-}
-"""Table I of the paper: share of sample points beyond each of `LIMITS` [%]."""
+TABLE_ONE = ["path", "points", "median [cm]", "> 10 cm, paper [%]", "> 15", "> 20", "> 25"]
+"""The head of `table_one`."""
 OF_THE_DRIVE: dict[str, dict[str, dict[str, Any]]] = {
     "as it is": {},
     "no blind sector": {"lidar": {"blind_deg": 0.0}},
@@ -113,17 +106,31 @@ def labels(
     return found
 
 
-def table_one(found: dict[str, pd.Series]) -> str:
-    """Markdown: shares beyond each limit, ours and the paper's."""
-    lines = ["| path | points | > 10 cm, paper | > 15 | > 20 | > 25 | median |", "|---" * 7 + "|"]
-    for name, error in (found | {"all": pd.concat(list(found.values()))}).items():
-        shares = (
-            f"{100 * (error > limit).mean():.1f}, {paper:.1f}"
-            for limit, paper in zip(LIMITS, PAPER[name], strict=True)
-        )
-        row = [name, str(len(error)), *shares, f"{100 * error.median():.1f} cm"]
-        lines.append("| " + " | ".join(row) + " |")
-    return "\n".join(lines)
+def table_one(labels: pd.DataFrame) -> list[list[str]]:
+    """Rows of Markdown cells: path, labels, median, shares beyond each limit, ours and the paper's.
+
+    Args:
+        labels: `path` and `error_mean` [m] of each, of one lidar.
+    """
+    (ours,), paper = table_i(labels), paper_table_i()
+    of_paper = {row["path"]: row["shares_over"] for row in paper["paths"]}
+    of_paper |= {"all": paper["weighted"]["shares_over"]}
+    lines = []
+    for row in [*ours["paths"], {"path": "all", **ours["weighted"]}]:
+        theirs = of_paper.get(row["path"], {})
+        shares = [
+            f"{100 * share:.1f}, " + (f"{100 * theirs[limit]:.1f}" if theirs else "")
+            for limit, share in row["shares_over"].items()
+        ]
+        middle = f"{100 * row['median']:.1f}"
+        lines.append([row["path"], str(row["points"]), middle, *shares])
+    return lines
+
+
+def markdown(rows: list[list[str]], head: list[str]) -> str:
+    """A Markdown table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def ceiling(first: dict[str, pd.Series], second: dict[str, pd.Series]) -> str:
@@ -252,7 +259,9 @@ def main(given: argparse.Namespace) -> None:
         for drive in given.drives
     ]
     for drive, table in zip(given.drives, found, strict=True):
-        print(f"drive {drive}, preset {given.preset}:\n\n{table_one(table)}\n")
+        rows = pd.concat([pd.DataFrame({"path": p, "error_mean": e}) for p, e in table.items()])
+        told = markdown(table_one(rows), TABLE_ONE)
+        print(f"drive {drive}, preset {given.preset}:\n\n{told}\n")
     for drive, table in zip(given.drives[1:], found[1:], strict=True):
         print(f"drive {drive} from drive {given.drives[0]}:\n\n{ceiling(found[0], table)}\n")
     if given.against is not None:

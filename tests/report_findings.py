@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from tilestream.label import disc_starts
 from tilestream.model.registry import REGRESSORS
 from tilestream.records import Float64
 from tilestream.report import Findings, write_report
@@ -79,6 +80,7 @@ def labels_of(places: pd.DataFrame, groups: tuple[str, ...], seed: int = 1) -> p
                     "group": group,
                     "path": known["route_id"].to_numpy(),
                     "block": known["route_id"].to_numpy() + "#00",
+                    "sample": known["sample"].to_numpy(),
                     "arc_length": known["arc_length"].to_numpy(),
                     "error_mean": known["estimate"].to_numpy() * noise,
                     "held_out": known["estimate"].to_numpy() * 1.1,
@@ -116,6 +118,19 @@ def cloud_around(x: float, y: float, z: float) -> Float64:
     ]
     points: Float64 = np.concatenate([road, *sides]) + np.array([x, y, z])
     return points
+
+
+def ends_of(group: str, sample: int) -> pd.DataFrame:
+    """Starts of which those ahead fail and end at 1.5 m; the others end 5 cm to the left."""
+    at = disc_starts()
+    fail = at[:, 0] > 0.0
+    along, across = np.where(fail, 1.5, 0.0), np.where(fail, 0.0, 0.05)
+    return pd.DataFrame(
+        {
+            "group": group, "sample": sample, "from_along": at[:, 0], "from_across": at[:, 1],
+            "along": along, "across": across, "error": np.hypot(along, across),
+        }
+    )  # fmt: skip
 
 
 AGAIN = {
@@ -196,6 +211,7 @@ def whole(seed: int = 0) -> Findings:
         drives=(DriveMeasured("morning", 500, 500, 480, 480, 480, {"after the last pose": 20}),),
         lost_labels=[{"reason": "label failed", "count": 3, "detail": "nothing near"}],
         crs="EPSG:32654",
+        ends=ends_of,
         around=cloud_around,
     )
 

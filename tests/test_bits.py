@@ -108,7 +108,7 @@ def test_products_and_sums_of_rows_round_by_the_row_alone(
 @settings(max_examples=30)
 def test_the_error_of_a_start(some: NDArray[np.int64], seed: int) -> None:
     T_map_true, T_map_final = poses(seed, 1)[0], poses(seed)
-    for name in ("along", "across", "up", "yaw", "error"):
+    for name in ("along", "across", "up", "roll", "pitch", "yaw_vector", "yaw", "error"):
         same(some, lambda r, name=name: start_errors(T_map_true, T_map_final[r])[name])
 
 

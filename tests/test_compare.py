@@ -24,7 +24,7 @@ from tilestream.formats.routes import route_of
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY
 from tilestream.pipeline.jobs.along_routes import observe_along
 from tilestream.report import write_comparison
-from tilestream.report.comparison import CELL_BYTES, Comparison
+from tilestream.report.comparison import CELL_BYTES, CHOICE_COLUMNS, Comparison
 from tilestream.settings import VirtualSettings
 from tilestream.store import cells_table
 from tilestream.tables import read_tables
@@ -85,8 +85,8 @@ def made_up(
         pd.DataFrame(rows, columns=columns),
         pd.DataFrame(
             {"choice": names, "vehicle": "car", "sensor": "car", "range_max": 9.0}
-            | {"blind_rear_deg": 0.0, "cell_size": sizes}
-        )[["choice", "vehicle", "sensor", "range_max", "blind_rear_deg", "cell_size"]],
+            | {"blind_rear_deg": 0.0, "scan_leaf": 2.0, "cell_size": sizes}
+        )[list(CHOICE_COLUMNS)],
         pd.DataFrame(
             [(tile, size, count) for tile in tiles for size, count in counts.items()],
             columns=["tile", "cell_size", "cells"],
@@ -118,6 +118,34 @@ def test_each_choice_is_as_if_it_were_alone(
     assert rows["tile"].tolist() == [
         str(store.grid.key_at(x, y)) for x, y in zip(alone["x"], alone["y"], strict=True)
     ]
+
+
+def test_a_leaf_thins_the_scans_of_its_choice_alone(
+    store: ts.TileStore, route: ts.Route, tmp_path: Path
+) -> None:
+    matcher = ts.RegistrationSettings.autoware()
+    how: dict[str, Any] = {"spacing": 24.0, "seeing": SEEING}
+    choices = choices_of([SENSOR], [12.0], [0.0], [2.0], [None, 0.5])
+    both = compare(store, [route], tmp_path / "both", choices, **how)
+    assert both.choices["choice"].tolist() == ["short-12m-cell2m", "short-12m-leaf0.5m-cell2m"]
+    assert both.choices["scan_leaf"].tolist() == [2.0, 0.5]
+    assert "registration.scan_leaf" not in both.facts
+    assert both.facts["registration.solver"] == "raw"
+    for choice, leaf in zip(both.choices["choice"], (2.0, 0.5), strict=True):
+        alone = observe_along(
+            store,
+            [route],
+            tmp_path / choice,
+            spacing=24.0,
+            sensor=SENSOR,
+            seeing=SEEING.model_copy(update={"range_max": 12.0}),
+            registration=matcher.model_copy(update={"scan_leaf": leaf}),
+        )
+        rows = both.rows[both.rows["choice"] == choice].reset_index(drop=True)
+        shared = [column for column in rows if column in alone]
+        pd.testing.assert_frame_equal(rows[shared], alone[shared], check_exact=True)
+    thick, thin = (part["vd_mean"].dropna() for _, part in both.rows.groupby("choice", sort=False))
+    assert (thick.to_numpy() != thin.to_numpy()).any()
 
 
 def test_more_range_never_makes_fewer_returns(found: Comparison, street: Path) -> None:
@@ -324,6 +352,7 @@ def test_the_command_compares_and_explains_itself(
         (["--range", "500"], "VLP16 sees 100 m"),
         (["--range", "-1"], "range_max"),
         (["--blind-rear", "400"], "blind_rear_deg"),
+        (["--scan-leaf", "-1"], "scan_leaf"),
         (["--range", "30,30"], "two choices are named VLP16-30m-cell2m"),
         (["--sensor", "VLP99"], "no such sensor"),
         (["--cap", "0"], "give metres above 0"),
@@ -337,6 +366,8 @@ def test_names_are_safe_and_told_apart() -> None:
     assert re.fullmatch(r"[A-Za-z0-9_+-][A-Za-z0-9_+.-]*", choice.name)
     assert choice.name.endswith("-30m-rear120-cell1.5m")
     assert Choice(ts.VLP16).name == "VLP16-cell2m"
+    assert Choice(ts.VLP16, scan_leaf=0.5).vehicle == "VLP16-leaf0.5m"
+    assert Choice(ts.VLP16, scan_leaf=0.0).name == "VLP16-leaf0m-cell2m"
     with pytest.raises(UsageError, match="whole millimetres"):
         Choice(ts.VLP16, cell_size=0.00015)
     with pytest.raises(UsageError, match="give more than 0"):

@@ -11,7 +11,13 @@ from scenes import UTM, scene
 from test_registration import T_MAP_LIDAR, scan_of
 
 from tilestream.errors import RegistrationError, UsageError
-from tilestream.label import disc_starts, localization_error, refined_pose, start_poses
+from tilestream.label import (
+    disc_starts,
+    localization_error,
+    refined_pose,
+    start_errors,
+    start_poses,
+)
 from tilestream.ndt import cells_of
 from tilestream.records import Cells, LocalizationError
 from tilestream.registration import register
@@ -112,6 +118,44 @@ def test_errors_are_in_the_frame_of_the_true_heading(
         assert label.yaw[k] == pytest.approx(math.remainder(turned, 2 * math.pi), abs=1e-12)
 
 
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.floats(-1.8, 1.8), min_size=6, max_size=6),
+    st.lists(st.floats(-50.0, 50.0), min_size=6, max_size=6),
+)
+def test_the_six_errors_lead_from_the_true_pose_to_the_final_one(
+    turns: list[float], places: list[float]
+) -> None:
+    """Also where the lidar is tilted, and where a start ends upside down."""
+    T_true, T_final = np.eye(4), np.eye(4)
+    for T, half in ((T_true, slice(0, 3)), (T_final, slice(3, 6))):
+        T[:3, :3], T[:3, 3] = expm(np.array(turns[half])), places[half]
+    found = {name: float(values[0]) for name, values in start_errors(T_true, T_final[None]).items()}
+    heading = math.atan2(T_true[1, 0], T_true[0, 0])
+    c, s = math.cos(heading), math.sin(heading)
+    axes = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    w = np.array([found[name] for name in ("roll", "pitch", "yaw_vector")]) @ axes
+    moved = np.array([found[name] for name in ("along", "across", "up")]) @ axes
+    assert np.linalg.norm(w) <= math.pi + 1e-9
+    np.testing.assert_allclose(expm(w) @ T_true[:3, :3], T_final[:3, :3], atol=1e-9)
+    np.testing.assert_allclose(T_true[:3, 3] + moved, T_final[:3, 3], atol=1e-9)
+
+
+def test_each_rotation_error_has_its_axis_and_sign() -> None:
+    """Of a vehicle that drives in map y: roll is a turn about y, pitch one about -x."""
+    T_true = np.eye(4)
+    T_true[:3, :3] = expm(np.array([0.0, 0.0, math.pi / 2]))
+    T_final = np.tile(T_true, (3, 1, 1))
+    for T, w in zip(T_final, 0.1 * np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]]), strict=True):
+        T[:3, :3] = expm(w) @ T_true[:3, :3]
+    found = start_errors(T_true, T_final)
+    for k, name in enumerate(("roll", "pitch", "yaw_vector")):
+        np.testing.assert_allclose(found[name], 0.1 * np.eye(3)[k], atol=1e-12)
+    np.testing.assert_allclose(found["yaw"], [0.0, 0.0, 0.1], atol=1e-12)
+    ahead = T_final[1, :3, 0]
+    assert ahead[2] < 0.0  # pitched down
+
+
 def check_summary(label: LocalizationError) -> None:
     """Every summary, from the per-start results."""
     errors = label.error.tolist()
@@ -120,7 +164,7 @@ def check_summary(label: LocalizationError) -> None:
     near = [e for e, o in zip(errors, offsets, strict=True) if np.linalg.norm(o) <= 1.0 + 1e-9]
     assert label.error_mean == pytest.approx(math.fsum(errors) / len(errors))
     assert label.p_fail == pytest.approx(1 - len(held) / len(errors))
-    for name in ("along", "across", "up", "yaw"):
+    for name in ("along", "across", "up", "roll", "pitch", "yaw"):
         expected = math.fsum(abs(v) for v in getattr(label, name)) / len(errors)
         assert getattr(label, f"{name}_mean") == pytest.approx(expected)
     if held:

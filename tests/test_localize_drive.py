@@ -11,6 +11,8 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from killed import killed_after
 from logs import SECOND, START, pose
 from scenes import PLACES, in_map
@@ -20,16 +22,19 @@ from tilestream.cli import run
 from tilestream.errors import PoseError, TileNotReadyError, UsageError
 from tilestream.formats.logs import open_log
 from tilestream.formats.logs.degrade import degraded
+from tilestream.formats.motion import along
 from tilestream.formats.points.pcd import write_pcd
-from tilestream.label import refined_pose, start_poses
+from tilestream.label import refined_pose, start_errors, start_poses
 from tilestream.marks import Mark
 from tilestream.pipeline.engine.attempt import Outcome
+from tilestream.pipeline.jobs.drive_measured import drive_measured
 from tilestream.pipeline.jobs.localize import REACH, choose_samples
 from tilestream.pipeline.jobs.run_folder import map_of
 from tilestream.pipeline.stages.drive_scans import Reading
 from tilestream.pipeline.stages.label import ERROR_COLUMNS
 from tilestream.pipeline.stages.register import START_COLUMNS
 from tilestream.records import Cells
+from tilestream.report.log_poses import note_of_log_poses
 from tilestream.settings import StartSettings
 from tilestream.store import POINTS, Tile
 from tilestream.tables import read_mark, read_tables
@@ -153,7 +158,7 @@ def test_every_label_is_that_of_localization_error(
         )
         for name in ("error_mean", "p_fail", "mean_held", "median_held", "p95_held"):
             np.testing.assert_array_equal(row[name], getattr(expected, name))  # NaN: all failed
-        for name in ("along", "across", "up", "yaw"):
+        for name in ("along", "across", "up", "roll", "pitch", "yaw"):
             assert row[f"{name}_mean"] == getattr(expected, f"{name}_mean")
         assert (row["error_floor"], row["error_tail"]) == (
             expected.error_floor,
@@ -165,7 +170,8 @@ def test_every_label_is_that_of_localization_error(
         assert row["starts"] == 13
         assert row["points"] == expected.registrations.points
         mine = starts[starts["sample"] == row["sample"]]
-        for name in ("along", "across", "up", "yaw", "error", "converged", "iterations"):
+        axes = ("along", "across", "up", "roll", "pitch", "yaw_vector", "yaw")
+        for name in (*axes, "error", "converged", "iterations"):
             np.testing.assert_array_equal(mine[name], getattr(expected, name))
         for name in ("score", "nvtl", "hits"):
             np.testing.assert_array_equal(mine[name], getattr(expected.registrations, name))
@@ -213,6 +219,17 @@ def test_a_refined_true_pose_is_recorded_and_used(
         T = refined_pose(fine, scan.points, scan.T_map_lidar)
         assert (row.x, row.y, row.z) == tuple(T[:3, 3])
         assert (row.x, row.y) != tuple(scan.T_map_lidar[:2, 3])
+        off = start_errors(T, scan.T_map_lidar[None])
+        for name in ("along", "across", "up", "yaw"):
+            assert getattr(row, f"log_{name}") == off[name][0]
+    (told,) = note_of_log_poses(labels)
+    far = np.linalg.norm(labels[["log_along", "log_across", "log_up"]], axis=1)
+    assert f"are {100 * np.median(far):.1f} cm from the refined ones (median of 2 scans" in told
+    assert f"{100 * labels['log_across'].median():+.1f} cm across" in told
+    own = plain[0].filter(regex="^log_")
+    assert own.shape[1] == 4
+    assert own.isna().all(axis=None)
+    assert note_of_log_poses(plain[0]) == []
 
 
 def test_one_scan_is_chosen_per_metre_of_the_drive(tmp_path: Path) -> None:
@@ -236,6 +253,78 @@ def test_one_scan_is_chosen_per_metre_of_the_drive(tmp_path: Path) -> None:
             assert sample.number == number
             assert sample.arc_length == pytest.approx(along[sample.scan] - along[1])
             assert sample.stamp_ns == log.stamps_ns[sample.scan]
+
+
+@given(
+    steps=st.lists(st.sampled_from([0.0, 0.05, 0.3, 0.7, 1.6]), min_size=1, max_size=25),
+    per_point=st.integers(1, 5),
+    spacing=st.sampled_from([0.6, 1.0, 2.5]),
+)
+@settings(max_examples=25, deadline=None)
+def test_other_scans_of_a_sample_point_are_the_nearest_and_of_no_other(
+    steps: list[float], per_point: int, spacing: float, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    x = np.cumsum([0.0, *steps])
+    poses = {i: pose(x=float(at)) for i, at in enumerate(x)}
+    path = tmp_path_factory.mktemp("dense") / "dense.mcap"
+    write_drive(path, dict.fromkeys(poses, np.ones((1, 3))), poses, period_s=0.1)
+    log = open_log(path)
+    one = choose_samples(log, ts.ScanSelection(), spacing)
+    several = choose_samples(log, ts.ScanSelection(), spacing, per_point)
+    scans = [sample.scan for sample in several]
+    assert len(set(scans)) == len(scans)
+    arc = dict(enumerate(along(log.T_map_lidar[:, :3, 3])))
+    for own in one:
+        here = [sample for sample in several if sample.number == own.number]
+        assert here[0] == own
+        assert 1 <= len(here) <= per_point
+        away = [abs(arc[sample.scan] - arc[own.scan]) for sample in here]
+        assert away == sorted(away)
+        assert away[-1] <= 0.5
+        for scan in set(range(len(log))) - set(scans):  # one as near as the last would be taken
+            nearest = min(abs(arc[scan] - arc[other.scan]) for other in one)
+            mine = abs(arc[scan] - arc[own.scan])
+            if mine == nearest and mine < 0.5 - 1e-9 and len(here) < per_point:
+                others = [o for o in one if abs(arc[scan] - arc[o.scan]) == nearest]
+                assert len(others) > 1
+    assert [sample.number for sample in several] == sorted(sample.number for sample in several)
+
+
+def test_a_label_of_several_scans_is_the_mean_of_their_labels(
+    store: ts.TileStore, drive: Path, plain: tuple[pd.DataFrame, Path], tmp_path: Path
+) -> None:
+    """Scans 10 cm apart, three at each place; one of the second place is too thin."""
+    poses, scans = {}, {}
+    for k in range(6):
+        poses[k] = lidar_at(4 + 2 * (k // 3))
+        poses[k][0, 3] += 0.1 * (k % 3)
+        scans[k] = seen_from(poses[k], 300 + k)
+    scans[5] = scans[5][:4]
+    log = write_drive(tmp_path / "dense.mcap", scans, poses, period_s=0.5)
+    how: dict[str, Any] = {"starts": FEW, "spacing": 5.9}
+    each = ts.localize(store, log, tmp_path / "each", starts=FEW, spacing=0.09)
+    assert each["scan"].tolist() == list(range(6))
+    mean = ts.localize(store, log, tmp_path / "mean", **how, scans_per_point=3)
+    assert mean["scans"].tolist() == [3, 2]
+    assert mean["starts"].tolist() == [39, 26]
+    for row, of in zip(mean.to_dict("records"), ([0, 1, 2], [3, 4]), strict=True):
+        own = each[each["scan"].isin(of)]
+        for name in ("error_mean", "p_fail", "along_mean", "roll_mean", "error_floor", "nvtl"):
+            assert row[name] == pytest.approx(own[name].mean()), name
+        assert row["scan_spread"] == pytest.approx(own["error_mean"].std())
+        assert row["scan"] in of
+        at = own[own["scan"] == row["scan"]].iloc[0]
+        assert (row["x"], row["y"], row["heading"]) == (at["x"], at["y"], at["heading"])
+    assert each["scan_spread"].isna().all()
+    starts = ts.starts_of(tmp_path / "mean", 1)
+    assert starts["scan"].unique().tolist() == [3, 4]
+    measured = drive_measured("d", open_log(log), ts.ScanSelection(), 5.9, mean, 3)
+    assert measured.measured == 2
+    assert measured.reasons == {"beside another scan of the same sample point": 4}
+    split = ts.localize(store, log, tmp_path / "split", **how, scans_per_point=3, starts_per_task=5)
+    pd.testing.assert_frame_equal(split, mean, check_exact=True)
+    with pytest.raises(UsageError, match="scans_per_point"):
+        ts.localize(store, log, tmp_path / "none", **how, scans_per_point=0)
 
 
 def test_a_drive_that_stands_is_sampled_there_once(tmp_path: Path) -> None:
@@ -397,6 +486,7 @@ def test_scans_that_cannot_be_registered_are_rows_that_say_why(
     assert "the scan has 9 points" in labels["reason"][2]
     assert labels["x"].tolist() == [poses[i][0, 3] for i in range(4)]
     numbers = [c.name for c in ERROR_COLUMNS if c.criterion == "label" and c.dtype == "float64"]
+    numbers.remove("scan_spread")  # of several scans only
     assert labels.loc[1:2, numbers].isna().all(axis=None)
     assert labels.loc[[0, 3], numbers].notna().all(axis=None)
     assert labels["starts"].tolist() == [13, 0, 0, 13]

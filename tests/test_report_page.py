@@ -69,7 +69,7 @@ def text_of(page: Path | Findings, section: str) -> str:
 def rendered(found: Findings) -> str:
     """The page alone, without pictures of the worst places."""
     content = summary(found, LIMIT)
-    return report_page(found, content, dict.fromkeys(range(1, 11), "not taken"))
+    return report_page(found, content, dict.fromkeys(range(1, 11), "not taken"), "not drawn")
 
 
 @pytest.mark.parametrize("name", ["whole", "without_labels", "one_place", "nothing_estimated"])
@@ -80,7 +80,7 @@ def test_every_section_is_there_in_order_and_says_something(
     source = path.read_text(encoding="utf-8")
     there = re.findall(r'<section id="([^"]+)">', source)
     assert there == re.findall(r'<a href="#([^"]+)">', source)
-    assert len(there) == 10
+    assert len(there) == 13
     for section in there:
         assert len(text_of(path, section)) > 80, section
 
@@ -90,6 +90,9 @@ def test_what_is_empty_says_why(others: dict[str, Path]) -> None:
     for section, why in (
         ("worst", "made without the map"),
         ("paths", "No place was labelled"),
+        ("ends", "No picture: no place was labelled"),
+        ("table-i", "the paper's own figures stand alone"),
+        ("table-iii", "the paper's own paths stand alone"),
         ("importances", "No forest was trained"),
         ("table-iv", "no labels, so nothing can be judged"),
         ("calibration", "No interval was checked"),
@@ -117,6 +120,26 @@ def test_the_headline_is_in_figures_that_a_person_reads(found: Findings, page: P
         "458 m of road, 460 sample points",
     ):
         assert figure in text
+
+
+def test_table_one_and_three_stand_beside_the_papers(found: Findings, page: Path) -> None:
+    text = text_of(page, "table-i")
+    assert "V 794 – 86.0 % 33.4 % 15.0 % 7.0 %" in text
+    assert "mean of the paths – – 40.4 % 18.8 % 10.3 % 6.2 %" in text
+    error = found.labels["error_mean"]
+    shares = " ".join(f"{100 * (error > limit).mean():.1f} %" for limit in (0.1, 0.15, 0.2, 0.25))
+    assert f"all, every label alike {len(error)} {100 * error.median():.1f} cm {shares}" in text
+    described = text_of(page, "table-iii")
+    assert "III 2 m 270 m 269 1 residential area" in described
+    here = found.labels[found.labels["path"] == "I"]
+    length = here["arc_length"].max() - here["arc_length"].min()
+    assert f"I – {length:.0f} m {len(here)} 2 –" in described
+    lidars = replace(found, labels=found.labels.assign(as_sensor=found.labels["group"]))
+    assert "this run, morning" in text_of(lidars, "table-i")
+    known = found.labels.assign(feature_count=120.0, D1_ratio=0.1, D2_ratio=0.6, D3_ratio=0.3)
+    text = text_of(replace(found, labels=known, cell_size=1.5), "table-iii")
+    assert "I 1.5 m" in text
+    assert "120 cells in view: 10 % like poles, 60 % like walls, 30 % like bushes" in text
 
 
 def test_the_map_holds_every_place_once(found: Findings, page: Path) -> None:
@@ -195,7 +218,7 @@ def test_the_worst_places_are_told_in_words_and_pictures(found: Findings, page: 
         start = f"{number} {place['route_id']} , {place['arc_length']:.0f} m along"
         assert start in text
         assert cm(place["estimate"]).replace("\u00a0", " ") in text
-    assert page.read_text().count('src="data:image/png;base64,') == 10
+    assert page.read_text().count('src="data:image/png;base64,') == 10 + 1  # the ends
 
 
 def test_table_iv_stands_beside_the_papers_and_names_the_leak(page: Path) -> None:
@@ -399,7 +422,7 @@ def test_a_browser_shows_what_lacks_something(
     browser: Page, others: dict[str, Path], name: str
 ) -> None:
     tab = opened(browser, others[name])
-    assert tab.evaluate("document.querySelectorAll('section').length") == 10
+    assert tab.evaluate("document.querySelectorAll('section').length") == 13
     calm(tab)
 
 

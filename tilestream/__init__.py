@@ -39,6 +39,7 @@ from tilestream.pipeline.jobs.along_routes import factors_along as factors_along
 from tilestream.pipeline.jobs.along_routes import observe_along as observe_along
 from tilestream.pipeline.jobs.ingest import ingest as ingest
 from tilestream.pipeline.jobs.localize import localize as localize
+from tilestream.pipeline.jobs.starts_of import starts_of as starts_of
 from tilestream.records import Cells as Cells
 from tilestream.records import LocalizationError as LocalizationError
 from tilestream.records import Registrations as Registrations

@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from tilestream.errors import RegistrationError, UsageError
 from tilestream.grid import MM_PER_M, whole_mm
-from tilestream.kernels.fixed_order import norms
+from tilestream.kernels.fixed_order import norms, row_sums
 from tilestream.matcher import RegistrationSettings
 from tilestream.records import Cells, Float64, LocalizationError, TruePose
 from tilestream.registration import register, rigid_poses
@@ -25,7 +26,7 @@ NEAR = 1.0
 FINE_CELL, FINE_RADIUS, FINE_STEP = 1.0, 0.5, 0.05
 """The refined true pose: cell size, search radius and step [m] (the paper's section VI)."""
 
-_AXES = ("along", "across", "up", "yaw")
+_AXES = ("along", "across", "up", "roll", "pitch", "yaw")
 
 
 def disc_starts(radius: float = 2.0, step: float = 0.2) -> Float64:
@@ -125,25 +126,40 @@ def localization_error(
 def start_errors(T_map_true: Float64, T_map_final: Float64) -> dict[str, Any]:
     """The error of each start, in the frame of the true heading.
 
+    `along`, `across`, `up` and the rotation vector (`roll`, `pitch`, `yaw_vector`) are the whole
+    error: with the true pose they give the final one.
+
     Args:
         T_map_true: (4, 4) true pose.
         T_map_final: (k, 4, 4) final poses of the starts.
 
     Returns:
-        (k,) each: `along`, `across`, `up` [m], `yaw` [rad], `error` (the 3D norm) [m], as the
-        fields of `LocalizationError` say.
+        (k,) each: `along`, `across`, `up` [m], `roll`, `pitch`, `yaw_vector`, `yaw` [rad], `error`
+        (the 3D norm) [m], as the fields of `LocalizationError` say.
     """
     heading = math.atan2(T_map_true[1, 0], T_map_true[0, 0])
     c, s = math.cos(heading), math.sin(heading)
     offset = T_map_final[:, :3, 3] - T_map_true[:3, 3]
     turned = np.arctan2(T_map_final[:, 1, 0], T_map_final[:, 0, 0]) - heading
+    rotation = _rotation_vectors(T_map_true[:3, :3], T_map_final[:, :3, :3])
     return {
         "along": offset[:, 0] * c + offset[:, 1] * s,
         "across": offset[:, 1] * c - offset[:, 0] * s,
         "up": offset[:, 2],
+        "roll": rotation[:, 0] * c + rotation[:, 1] * s,
+        "pitch": rotation[:, 1] * c - rotation[:, 0] * s,
+        "yaw_vector": rotation[:, 2],
         "yaw": (turned + np.pi) % (2.0 * np.pi) - np.pi,
         "error": norms(offset),
     }
+
+
+def _rotation_vectors(R_true: Float64, R_final: Float64) -> Float64:
+    """(k, 3) rotation vectors w in the map frame [rad]: Exp(w) R_true = R_final, (k, 3, 3)."""
+    products = (R_final[:, :, None] * R_true).reshape(-1, 3)
+    R_error = row_sums(products).reshape(-1, 3, 3)  # R_final R_true^T
+    vectors: Float64 = Rotation.from_matrix(R_error).as_rotvec()
+    return vectors
 
 
 def summary(errors: Mapping[str, Float64], distance: Float64) -> dict[str, Any]:

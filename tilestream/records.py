@@ -282,8 +282,16 @@ class LocalizationError:
     """(k,) error across it [m], left positive."""
     up: Float64
     """(k,) error in map z [m]."""
+    roll: Float64
+    """(k,) component of the rotation error along the true heading [rad]. The rotation error is the
+    rotation vector w of Exp(w) R_true = R_final, no longer than pi."""
+    pitch: Float64
+    """(k,) its component across the true heading [rad], positive where the nose goes down."""
+    yaw_vector: Float64
+    """(k,) its component in map z [rad]."""
     yaw: Float64
-    """(k,) error of the heading [rad], in [-pi, pi)."""
+    """(k,) error of the heading [rad], in [-pi, pi); as `yaw_vector` while roll and pitch are
+    right."""
     error: Float64
     """(k,) 3D norm of the error [m]."""
     error_mean: float
@@ -302,6 +310,10 @@ class LocalizationError:
     """Mean of abs(across) [m]."""
     up_mean: float
     """Mean of abs(up) [m]."""
+    roll_mean: float
+    """Mean of abs(roll) [rad]."""
+    pitch_mean: float
+    """Mean of abs(pitch) [rad]."""
     yaw_mean: float
     """Mean of abs(yaw) [rad]."""
     error_floor: float

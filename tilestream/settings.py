@@ -265,6 +265,9 @@ class LabelSettings(Settings):
     """Where registrations start."""
     true_pose: TruePose = "log"
     """The true pose: as the log has it, or refined as the paper does."""
+    scans_per_point: Annotated[int, Field(ge=1, le=64)] = 1
+    """Scans that are measured at each sample point, as many as there are within 0.5 m along the
+    drive; its label is the mean over all of them."""
     allow_overlap: bool = False
     """Measure also with scans that the map was made of, whose errors are too small."""
 

@@ -1,4 +1,4 @@
-"""The job that compares: which lidar, which range, which map resolution suffices along a route.
+"""The job that compares: which lidar, which range, which resolution of map and scan suffices.
 
 All choices are one plan, observed side by side: what two of them need of the map is made once.
 """
@@ -42,10 +42,12 @@ FITTING = (200, 10_000)
 
 @dataclass(frozen=True)
 class Choice:
-    """A lidar on a vehicle, and the resolution of the map that it is matched with.
+    """A lidar on a vehicle, how its scans are thinned, and the resolution of the map that they are
+    matched with.
 
     Raises:
-        UsageError: a range beyond the sensor's, a blind sector or cell size that cannot be.
+        UsageError: a range beyond the sensor's, a blind sector, a cell size or a leaf that cannot
+            be.
     """
 
     sensor: Carrier
@@ -56,9 +58,12 @@ class Choice:
     """Sector to the rear that the vehicle hides [deg]."""
     cell_size: float = 2.0
     """Edge of an NDT cell [m], whole millimetres."""
+    scan_leaf: float | None = None
+    """Scans are thinned by voxels of this edge [m], 0: not at all; None: as the matcher does."""
 
     def __post_init__(self) -> None:
         self.seeing(VirtualSettings())
+        self.matcher(RegistrationSettings())
         if self.range_max is not None and self.range_max > self.sensor.range_max:
             raise UsageError(
                 f"{self.sensor.name} sees {self.sensor.range_max:g} m: "
@@ -75,6 +80,7 @@ class Choice:
             name or "sensor",
             "" if self.range_max is None else f"{self.range_max:g}m",
             f"rear{self.blind_rear_deg:g}" if self.blind_rear_deg else "",
+            "" if self.scan_leaf is None else f"leaf{self.scan_leaf:g}m",
         ]
         return "-".join(part for part in parts if part)
 
@@ -88,20 +94,31 @@ class Choice:
         own = {"range_max": self.range_max, "blind_rear_deg": self.blind_rear_deg}
         return VirtualSettings(**(base.model_dump() | own))
 
+    def matcher(self, base: RegistrationSettings) -> RegistrationSettings:
+        """What its scans are registered with: thinned by its leaf, the rest as in `base`."""
+        if self.scan_leaf is None:
+            return base
+        return RegistrationSettings(**(base.model_dump() | {"scan_leaf": self.scan_leaf}))
+
 
 def choices_of(
     sensors: Sequence[Carrier],
     ranges: Sequence[float | None],
     blind_rears_deg: Sequence[float],
     cell_sizes: Sequence[float],
+    scan_leaves: Sequence[float | None] = (None,),
 ) -> tuple[Choice, ...]:
-    """Every sensor at every range, blind sector and cell size, the last changing fastest.
+    """Every sensor at every range, blind sector, leaf of its scans and cell size, the last changing
+    fastest.
 
     Raises:
         UsageError: as `Choice`.
     """
-    product = itertools.product(sensors, ranges, blind_rears_deg, cell_sizes)
-    return tuple(Choice(*choice) for choice in product)
+    product = itertools.product(sensors, ranges, blind_rears_deg, scan_leaves, cell_sizes)
+    return tuple(
+        Choice(sensor, range_max, blind_rear, cell_size, leaf)
+        for sensor, range_max, blind_rear, leaf, cell_size in product
+    )
 
 
 def compare(
@@ -177,6 +194,8 @@ def compare(
         ignore_index=True,
     )
     own = {"range_max", "blind_rear_deg"}
+    leaf = {"scan_leaf"} if any(choice.scan_leaf is not None for choice in choices) else set()
+    matcher = registration.model_dump(exclude=leaf)
     facts = {
         "map": store.url,
         "tile_size": store.settings.tile_size,
@@ -184,10 +203,11 @@ def compare(
         "sensor_height": sensor_height,
         "route_z": route_z,
         "matcher": registration.told,
-        **{f"registration.{name}": value for name, value in registration.model_dump().items()},
+        **{f"registration.{name}": value for name, value in matcher.items()},
         **{f"seeing.{name}": value for name, value in seeing.model_dump(exclude=own).items()},
     }
-    return Comparison(rows, choice_table(choices), cells_of_map(plan, store), facts)
+    table = choice_table(choices, registration)
+    return Comparison(rows, table, cells_of_map(plan, store), facts)
 
 
 def plan_compare(
@@ -214,7 +234,7 @@ def plan_compare(
         observing = Observing(
             choice.sensor,
             choice.seeing(seeing),
-            registration,
+            choice.matcher(registration),
             choice.cell_size,
             sensor_height,
             route_z,
@@ -294,8 +314,8 @@ def cells_of_map(plan: Plan, store: TileStore) -> pd.DataFrame:
     return table.sort_values(["cell_size", "tile"], ignore_index=True)
 
 
-def choice_table(choices: Sequence[Choice]) -> pd.DataFrame:
-    """The choices as a table: a row each."""
+def choice_table(choices: Sequence[Choice], registration: RegistrationSettings) -> pd.DataFrame:
+    """The choices as a table: a row each; `registration` is their matcher but for the leaf."""
     return pd.DataFrame(
         {
             "choice": [choice.name for choice in choices],
@@ -303,6 +323,7 @@ def choice_table(choices: Sequence[Choice]) -> pd.DataFrame:
             "sensor": [choice.sensor.name for choice in choices],
             "range_max": [choice.range_max or choice.sensor.range_max for choice in choices],
             "blind_rear_deg": [choice.blind_rear_deg for choice in choices],
+            "scan_leaf": [choice.matcher(registration).scan_leaf for choice in choices],
             "cell_size": [whole_mm(c.cell_size, "cell_size") / MM_PER_M for c in choices],
         }
     )

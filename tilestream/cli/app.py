@@ -50,7 +50,7 @@ COMMANDS = {
     "factors": ("routes", "Compute the factors of the map at every sample point of a route."),
     "compare": (
         "routes",
-        "Compare lidars, ranges and map resolutions along routes, from the map alone.",
+        "Compare lidars, ranges, resolutions of map and scan along routes, from the map alone.",
     ),
     "simulate": (
         "jobs",

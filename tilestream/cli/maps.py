@@ -13,11 +13,19 @@ from tilestream.cli.fields import fields, with_settings
 from tilestream.cli.options import AsJson, DryRun, StoreUrl
 from tilestream.cli.printing import out, print_json, say, say_notes
 from tilestream.cli.progress import progress
-from tilestream.cli.tables import TILE_CHANGES, diff_table, info_table, plan_table, tile_table
+from tilestream.cli.tables import (
+    TILE_CHANGES,
+    diff_table,
+    ends_table,
+    info_table,
+    plan_table,
+    tile_table,
+)
 from tilestream.errors import PartialError
 from tilestream.pipeline.jobs import ingest as ingest_map
 from tilestream.pipeline.jobs.run_inputs import ingest_settings, scans_of
 from tilestream.pipeline.jobs.sources import map_notes
+from tilestream.pipeline.jobs.starts_of import starts_of as ends_of
 from tilestream.settings import IngestSettings, LogOptions, LogSettings, MapSettings, PlaceSettings
 from tilestream.store import POINTS, TileStore, open_store
 
@@ -150,9 +158,24 @@ def info(
         typer.Argument(help="Points, a log, routes, a map folder, a store, a run, or a model."),
     ],
     log: Annotated[LogOptions, fields(*LogOptions.model_fields)],
+    starts_of: Annotated[
+        int | None,
+        typer.Option(
+            help="Of a run or of the tables of `localize`: where the starts of this sample point "
+            "of a drive began and ended."
+        ),
+    ] = None,
+    of_drive: Annotated[str, typer.Option(help="Its drive, where a run has several.")] = "",
     as_json: AsJson = False,
 ) -> None:
     """Show what is in anything that is read or made: extent, CRS, coverage, state, notes."""
+    if starts_of is not None:
+        rows = ends_of(file, starts_of, of_drive)
+        if as_json:
+            print_json(rows.to_dict("records"))
+        else:
+            out.print(ends_table(rows))
+        return
     found = describing.info(file, log)
     if as_json:
         print_json(found.plain())

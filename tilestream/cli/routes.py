@@ -35,6 +35,7 @@ from tilestream.pipeline.stages.factors import Looking
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.report import write_comparison
 from tilestream.report.drives import EVALUATED, DriveMeasured
+from tilestream.report.log_poses import note_of_log_poses
 from tilestream.report.segments import check_threshold
 from tilestream.sensor import SENSORS, sensor_of
 from tilestream.settings import (
@@ -54,6 +55,13 @@ Ranges = Annotated[
     list[str],
     typer.Option("--range-max", "--range", help="Usable ranges [m], e.g. 30,60; default: all."),
 ]
+Leaves = Annotated[
+    list[str],
+    typer.Option(
+        "--scan-leaf",
+        help="Leaves that scans are thinned by [m], e.g. 0.5,2.0; default: the matcher's.",
+    ),
+]
 BlindRears = Annotated[
     list[str],
     typer.Option(
@@ -69,7 +77,9 @@ def localize(
     folder: Annotated[str, typer.Option("--out", help="Folder of the tables.")],
     which_map: Annotated[MapSettings, fields("partial")],
     places: Annotated[PlaceSettings, fields("cell_size", "spacing", "memory")],
-    labels: Annotated[LabelSettings, fields("matcher", "true_pose", "allow_overlap")],
+    labels: Annotated[
+        LabelSettings, fields("matcher", "true_pose", "scans_per_point", "allow_overlap")
+    ],
     leaf: Annotated[RegistrationSettings, fields("scan_leaf")],
     starts: Annotated[StartSettings, fields("radius", "step")],
     drive: Annotated[
@@ -95,13 +105,17 @@ def localize(
         "registration": registration,
         "starts": starts,
         "true_pose": labels.true_pose,
+        "scans_per_point": labels.scans_per_point,
         "scans": scans_of(drive),
         "starts_per_task": starts_per_task,
         "memory": places.memory,
     }
     opened, reading = open_store(store), reading_of(drive)
     log = opened_log(reading)
-    shared = localize_drive.drive_overlap(reading, how["scans"], places.spacing, opened.sources())
+    several = labels.scans_per_point
+    shared = localize_drive.drive_overlap(
+        reading, how["scans"], places.spacing, opened.sources(), several
+    )
     of_drive = {drive.log: [*log.notes, *shared.notes], MATCHER: registration.notes}
     notes = noticed(map_notes(opened), of_drive)
     say_notes(notes)
@@ -128,7 +142,10 @@ def localize(
             partial=which_map.partial,
             allow_overlap=labels.allow_overlap,
         )
-    measured = drive_measured(drive.log, log, how["scans"], places.spacing, found)
+    measured = drive_measured(drive.log, log, how["scans"], places.spacing, found, several)
+    off = {drive.log: note_of_log_poses(found)}
+    say_notes(off)
+    notes = noticed(notes, off)
     if as_json:
         told = {"matcher": registration.told, "drive": measured.plain(), "notes": notes}
         print_json({**told, **error_facts(found)})
@@ -248,6 +265,7 @@ def compare(
     ] = ["2.0"],  # noqa: B006
     ranges: Ranges = [],  # noqa: B006
     blind_rear: BlindRears = ["0"],  # noqa: B006
+    leaves: Leaves = [],  # noqa: B006
     cap: Annotated[
         float, typer.Option(help="What 95 % of a tile's estimates must stay within [m].")
     ] = 0.15,
@@ -255,7 +273,7 @@ def compare(
     as_json: AsJson = False,
     cluster: Cluster = HERE,
 ) -> None:
-    """Compare lidars, ranges and map resolutions along routes, from the map alone."""
+    """Compare lidars, ranges, resolutions of map and scan along routes, from the map alone."""
     for limit in (report.threshold, cap):
         check_threshold(limit)
     opened = open_store(store)
@@ -270,6 +288,7 @@ def compare(
             numbers(ranges, "--range-max") or (None,),
             numbers(blind_rear, "--blind-rear-deg"),
             numbers(cell_size, "--cell-size") if own is None else [own],
+            numbers(leaves, "--scan-leaf") or (None,),
         )
         registration = registration.model_copy(update={"resolution": None})
         height, z = places.sensor_height, places.route_z

@@ -12,10 +12,12 @@ from tilestream.apps.diff import MapDiff
 from tilestream.apps.info import Info
 from tilestream.crs import named
 from tilestream.factors.catalogue import COLUMNS
+from tilestream.label import FAILED
 from tilestream.pipeline.engine.costs import core_hours
 from tilestream.pipeline.engine.plan import Plan, megabytes
 from tilestream.pipeline.jobs.forecast import Forecast
 from tilestream.report.drives import DriveMeasured
+from tilestream.report.paper_tables import LIMITS
 from tilestream.store import POINTS, TileStore
 
 
@@ -110,6 +112,24 @@ def info_table(found: Info) -> Table:
     return table
 
 
+ENDS = ("from_along", "from_across", "along", "across", "up", "error")
+"""What is told of each start [m]."""
+
+
+def ends_table(rows: pd.DataFrame) -> Table:
+    """Where the starts of a place began and ended, a line per start."""
+    failed = int((rows["error"] > FAILED).sum())
+    title = f"{len(rows)} starts of sample point {rows['sample'].iloc[0]}, {failed} failed"
+    table = Table(title=title, title_justify="left", box=SIMPLE)
+    for name in ("scan", "start", *(f"{name} [m]" for name in ENDS), "converged"):
+        table.add_column(name, justify="right")
+    for row in rows.to_dict("records"):
+        lengths = (f"{row[name]:.3f}" for name in ENDS)
+        converged = "yes" if row["converged"] else "no"
+        table.add_row(str(row["scan"]), str(row["start"]), *lengths, converged)
+    return table
+
+
 def _extent(found: Info) -> list[tuple[str, str]]:
     """From where to where it reaches: millimetres, or what they are in degrees."""
     if found.bounds is None:
@@ -151,10 +171,6 @@ def factor_table(rows: pd.DataFrame) -> Table:
     return table
 
 
-THRESHOLDS = (0.10, 0.15, 0.20, 0.25)
-"""The paper's error thresholds [m] (its Table I)."""
-
-
 def error_facts(labels: pd.DataFrame) -> dict[str, float | None]:
     """The errors of a drive in a few numbers: mean, median, tails [m], p_fail; None of nothing."""
     done = labels[labels["status"] == "done"]
@@ -169,7 +185,7 @@ def error_facts(labels: pd.DataFrame) -> dict[str, float | None]:
         "p_fail": float(done["p_fail"].mean()),
         "floor_m": float(done["error_floor"].mean()),
         "tail_m": float(done["error_tail"].mean()),
-        **{f"share_over_{t:.2f}_m": float((error > t).mean()) for t in THRESHOLDS},
+        **{f"share_over_{t:.2f}_m": float((error > t).mean()) for t in LIMITS},
     }
     return {name: None if math.isnan(value) else value for name, value in facts.items()}
 
@@ -180,10 +196,7 @@ READ_AS = {
     "median_m": (*CM, "median error"),
     "p95_m": (*CM, "95 % of the places have less"),
     "max_m": (*CM, "the largest"),
-    **{
-        f"share_over_{t:.2f}_m": (*PERCENT, f"of the places over {t * 100:g} cm")
-        for t in THRESHOLDS
-    },
+    **{f"share_over_{t:.2f}_m": (*PERCENT, f"of the places over {t * 100:g} cm") for t in LIMITS},
     "p_fail": (*PERCENT, "of the starts fail: they end over 50 cm away"),
     "floor_m": (*CM, "of the mean is floor: what starts within 1 m end with"),
     "tail_m": (*CM, "of the mean is tail: what farther starts add"),

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from scipy.spatial.transform import Rotation
 
 from tilestream.label import FAILED, disc_starts, start_errors
 from tilestream.local_map import LocalCells
@@ -23,8 +22,8 @@ from tilestream.registration import register
 RINGS = {"near": (0.0, 0.5, 1 / 4), "middle": (0.5, 0.75, 1 / 4), "far": (0.75, 1.0, 1 / 2)}
 """Rings of the disc of starts: inner and outer radius as shares of the disc's, and share of the
 starts of a draw. The near one, within 1.0 m, makes the floor; far starts decide the tail."""
-AXES = ("along", "across", "up", "roll", "pitch", "yaw")
-"""The six signed errors of a start."""
+AXES = ("along", "across", "up", "roll", "pitch", "yaw_vector")
+"""The six signed errors of a start (`start_errors`)."""
 NEIGHBOURS = 2.0
 """Virtual drives within this distance along the route are averaged [m]: the radius of the disc of
 starts."""
@@ -175,19 +174,8 @@ def ends_of(
     poses = np.repeat(T_map_lidar[None], len(starts.offset), axis=0)
     poses[:, :2, 3] += starts.offset
     ends = register(cells, points, poses, settings).T_map_lidar
-    errors = start_errors(T_map_lidar, ends) | _turns(T_map_lidar, ends)
+    errors = start_errors(T_map_lidar, ends)
     return Ends(starts, errors["error"], np.column_stack([errors[axis] for axis in AXES]))
-
-
-def _turns(T: Float64, T_ends: Float64) -> dict[str, Float64]:
-    w = Rotation.from_matrix(T_ends[:, :3, :3] @ T[:3, :3].T).as_rotvec()
-    h = math.atan2(T[1, 0], T[0, 0])
-    c, s = math.cos(h), math.sin(h)
-    return {
-        "roll": w[:, 0] * c + w[:, 1] * s,
-        "pitch": w[:, 1] * c - w[:, 0] * s,
-        "yaw": w[:, 2],
-    }
 
 
 def virtual_drive(drives: Sequence[Ends]) -> dict[str, float]:

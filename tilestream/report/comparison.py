@@ -18,7 +18,9 @@ ROW_COLUMNS = (
     "vd_mean", "vd_p_fail", "vd_along", "vd_across", "status", "reason",
 )  # fmt: skip
 """A row per choice and sample point: place [m], tile, what the virtual drive estimates [m, 1]."""
-CHOICE_COLUMNS = ("choice", "vehicle", "sensor", "range_max", "blind_rear_deg", "cell_size")
+CHOICE_COLUMNS = (
+    "choice", "vehicle", "sensor", "range_max", "blind_rear_deg", "scan_leaf", "cell_size",
+)  # fmt: skip
 """A row per choice; choices of one `vehicle` differ in the cell size only [m, deg]."""
 CELL_COLUMNS = ("tile", "cell_size", "cells")
 """A row per tile of the map and cell size [m]: how many cells it has."""

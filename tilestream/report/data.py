@@ -21,6 +21,8 @@ LABEL_COLUMNS = ("group", "path", "arc_length", "error_mean", "held_out")
 """What a labelled place must have."""
 AROUND = 40.0
 """How far round a place its picture reaches [m]."""
+Ends = Callable[[str, int], pd.DataFrame]
+"""Where the starts of a group's sample point began and ended, as `starts_of` tells it."""
 Around = Callable[[float, float, float], Float64]
 """(n, 3) map points [m] within about `AROUND` of a place in the map frame."""
 
@@ -74,8 +76,13 @@ class Findings:
     """How much of each drive was measured."""
     lost_labels: Sequence[Mapping[str, Any]] = ()
     """The labels that no model can learn from: `reason`, `count`, `detail`."""
+    cell_size: float | None = None
+    """Edge of the cells that labels were measured with [m]; None: not known."""
     crs: str | None = None
     """CRS of x and y, anything that pyproj reads; None: a local frame."""
+    ends: Ends | None = None
+    """The starts of a labelled place, for the pictures of the worst measured ones; None: no
+    pictures."""
     around: Around | None = None
     """The map round a place, for the pictures of the worst ones; None: no pictures."""
 

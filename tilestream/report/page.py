@@ -60,7 +60,10 @@ _ENVIRONMENT = _environment()
 
 
 def report_page(
-    found: Findings, content: Mapping[str, Any], pictures: Mapping[int, bytes | str]
+    found: Findings,
+    content: Mapping[str, Any],
+    pictures: Mapping[int, bytes | str],
+    ends: bytes | str,
 ) -> str:
     """The page of a run as HTML.
 
@@ -68,6 +71,7 @@ def report_page(
         found: what is reported.
         content: its `summary`.
         pictures: PNG of each of the worst places by number, or why there is none.
+        ends: PNG of where the starts of the worst measured places ended, or why there is none.
     """
     paths = content["paths"][:MOST_CHARTS]
     segments = sorted(content["segments"], key=lambda s: (-s["worst"], s["route_id"], s["begin"]))
@@ -82,6 +86,7 @@ def report_page(
         segments=segments[:MOST_SEGMENTS],
         paths=paths,
         pictures=pictures,
+        ends=ends,
         shown_every=charts.map_shows_every(found),
         clip=CLIP,
         bridge=BRIDGE,

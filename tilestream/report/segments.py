@@ -15,6 +15,8 @@ from tilestream.report.drives import EVALUATED
 
 WORST = 10
 """How many of the worst places are shown."""
+MEASURED = 6
+"""How many of the worst measured places are shown."""
 APART = 30.0
 """Least distance between two of them [m]: nearer ones are the same place twice."""
 BRIDGE = 5.0
@@ -130,11 +132,25 @@ def worst_places(places: pd.DataFrame, count: int = WORST, apart: float = APART)
 
     Distance is straight through the map, so two routes over one spot name it once.
     """
-    estimate, at = estimates(places), places[["x", "y", "z"]].to_numpy(np.float64)
-    at = np.where(np.isfinite(at), at, 0.0)
+    at = places[["x", "y", "z"]].to_numpy(np.float64)
+    return _apart(estimates(places), np.where(np.isfinite(at), at, 0.0), count, apart)
+
+
+def worst_measured(labels: pd.DataFrame, count: int = MEASURED, apart: float = APART) -> list[int]:
+    """Rows of the largest measured errors, the largest first, no two of a path nearer than `apart`
+    [m] along it.
+    """
+    paths, _ = pd.factorize(labels["path"])
+    along = labels["arc_length"].to_numpy(np.float64)
+    at = np.column_stack([along, paths * 2.0 * (np.ptp(along) + apart)])
+    return _apart(labels["error_mean"].to_numpy(np.float64), at, count, apart)
+
+
+def _apart(error: Float64, at: Float64, count: int, apart: float) -> list[int]:
+    """Rows of the largest errors that are known, no two of them nearer than `apart` [m]."""
     chosen: list[int] = []
-    for row in np.argsort(-estimate, kind="stable").tolist():
-        if len(chosen) == count or np.isnan(estimate[row]):
+    for row in np.argsort(-error, kind="stable").tolist():
+        if len(chosen) == count or np.isnan(error[row]):
             break
         if all(math.dist(at[row], at[other]) >= apart for other in chosen):
             chosen.append(row)

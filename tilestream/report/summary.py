@@ -13,7 +13,8 @@ from tilestream.records import Float64, Int64
 from tilestream.report.data import PLACE_COLUMNS, Findings, estimates, like_training
 from tilestream.report.formatting import cm, distance, known, percent, thousands
 from tilestream.report.lines import held_out_along, interval_factor
-from tilestream.report.segments import reaches, segments, worst_places
+from tilestream.report.paper_tables import paper_table_i, paper_table_iii, table_i, table_iii
+from tilestream.report.segments import reaches, segments, worst_measured, worst_places
 from tilestream.version import VERSION
 
 THRESHOLDS = (0.05, 0.10, 0.15, 0.20, 0.25, 0.50)
@@ -39,7 +40,12 @@ def summary(found: Findings, threshold: float) -> dict[str, Any]:
         "routes": routes(found.places, threshold),
         "segments": [segment(found.places, rows) for rows in runs],
         "worst": [place(found.places, row) for row in worst_places(found.places)],
+        "worst_measured": measured_worst(found.labels),
         "paths": paths(found),
+        "table_i": table_i(found.labels),
+        "paper_table_i": paper_table_i(),
+        "table_iii": table_iii(found.labels, found.cell_size),
+        "paper_table_iii": paper_table_iii(),
         "protocols": found.protocols.to_dict("records"),
         "table_iv": found.table_iv.to_dict("records"),
         "paper_table_iv": PAPER_TABLE.to_dict("records"),
@@ -171,6 +177,16 @@ def place(places: pd.DataFrame, row: int) -> dict[str, Any]:
     """One sample point with its estimate."""
     names = (*PLACE_COLUMNS, *(column.name for column in PREDICTION_COLUMNS))
     return {name: places[name].iloc[row] for name in names}
+
+
+def measured_worst(labels: pd.DataFrame) -> list[dict[str, Any]]:
+    """The places with the largest measured errors, the largest first."""
+    if labels.empty:
+        return []
+    names = ("group", "path", "sample", "arc_length", "error_mean", "p_fail")
+    rows = labels.iloc[worst_measured(labels)]
+    kept = rows[[name for name in names if name in labels]]
+    return [{str(k): v for k, v in row.items()} for row in kept.to_dict("records")]
 
 
 def paths(found: Findings) -> list[dict[str, Any]]:

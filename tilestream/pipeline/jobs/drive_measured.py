@@ -10,19 +10,27 @@ from tilestream.pipeline.jobs.localize import choose_samples
 from tilestream.report.drives import DriveMeasured
 
 NOT_SELECTED = "not selected"
+BESIDE = "beside another scan of the same sample point"
 STANDS = "where another scan stands for the same sample point"
 NO_LABEL = "whose task failed"
 NO_REASON = "without a reason"
 
 
 def drive_measured(
-    drive: str, log: ScanLog, scans: ScanSelection, spacing: float, labels: pd.DataFrame
+    drive: str,
+    log: ScanLog,
+    scans: ScanSelection,
+    spacing: float,
+    labels: pd.DataFrame,
+    per_point: int = 1,
 ) -> DriveMeasured:
     """How much of a drive was measured: `to_measure`, then `with_labels`."""
-    return with_labels(to_measure(drive, log, scans, spacing), labels)
+    return with_labels(to_measure(drive, log, scans, spacing, per_point), labels)
 
 
-def to_measure(drive: str, log: ScanLog, scans: ScanSelection, spacing: float) -> DriveMeasured:
+def to_measure(
+    drive: str, log: ScanLog, scans: ScanSelection, spacing: float, per_point: int = 1
+) -> DriveMeasured:
     """The scans of a drive before any is measured.
 
     Args:
@@ -30,13 +38,15 @@ def to_measure(drive: str, log: ScanLog, scans: ScanSelection, spacing: float) -
         log: its scans.
         scans: which of them are to be used.
         spacing: distance between sample points [m].
+        per_point: scans of a sample point, at most.
 
     Raises:
         UsageError: as `choose_samples`.
     """
     selected = scans.indices(log.stamps_ns)
     posed = int(log.posed[selected].sum())
-    places = len(choose_samples(log, scans, spacing))
+    chosen = choose_samples(log, scans, spacing, per_point)
+    places = chosen[-1].number + 1
     left_out = sum(log.left_out.values())
     return DriveMeasured(
         drive=drive,
@@ -49,7 +59,8 @@ def to_measure(drive: str, log: ScanLog, scans: ScanSelection, spacing: float) -
             **log.left_out,
             NOT_SELECTED: len(log) - len(selected),
             **log.unposed(selected),
-            STANDS: posed - places,
+            STANDS: posed - len(chosen),
+            BESIDE: len(chosen) - places,
             NO_LABEL: places,
         },
     )

@@ -1,8 +1,9 @@
 """The job that measures: a log and a map in, the localization error of every sample point out."""
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain, groupby
 from typing import Any
 
 import numpy as np
@@ -26,11 +27,13 @@ from tilestream.pipeline.stages.drive_scans import DriveScans, Reading, Sample, 
 from tilestream.pipeline.stages.label import label
 from tilestream.pipeline.stages.map_plan import MapPlan, apart
 from tilestream.pipeline.stages.register import MARGIN, Measuring, register
-from tilestream.records import Float64, TruePose
+from tilestream.records import Float64, Int64, TruePose
 from tilestream.settings import LabelSettings, StartSettings
 from tilestream.store import TileStore
 from tilestream.tables import read_tables
 
+BESIDE = 0.5
+"""How far along the drive other scans of a sample point may be from it [m]."""
 SCANS_PER_TASK = 8
 """Scans of a slice: about a second of work with 317 starts."""
 REACH = 250.0
@@ -47,6 +50,7 @@ def localize(
     registration: RegistrationSettings | None = None,
     starts: StartSettings | None = None,
     true_pose: TruePose = "log",
+    scans_per_point: int = 1,
     scans: ScanSelection | None = None,
     reading: Reading | None = None,
     starts_per_task: int | None = None,
@@ -58,9 +62,9 @@ def localize(
 ) -> pd.DataFrame:
     """Localize a drive in a map from many starts per sample point: what the error there is.
 
-    One scan is taken per sample point. Scans are read slice by slice and registered by one task
-    per slice; a run that was killed continues when called again. Tables of other scans or settings
-    in the same folder are removed, so that two data sets are never mixed.
+    One scan is taken per sample point, or several and their mean. Scans are read slice by slice and
+    registered by one task per slice; a run that was killed continues when called again. Tables of
+    other scans or settings in the same folder are removed, so that two data sets are never mixed.
 
     Args:
         store: the map.
@@ -72,6 +76,7 @@ def localize(
         registration: the matcher; default `autoware`, as of all jobs.
         starts: the starts; default the paper's 317.
         true_pose: `log`, or `refined` as the paper does.
+        scans_per_point: scans that are measured at each sample point, where there are as many.
         scans: which scans to use; default all.
         reading: how the log is read (topics, as if by a simpler sensor); its path is `log`.
         starts_per_task: splits the starts of a slice over several tasks; None: all in one.
@@ -98,7 +103,7 @@ def localize(
     how = replace(reading, path=os.fspath(log)) if reading else Reading(os.fspath(log))
     scans = scans or ScanSelection()
     if not allow_overlap:
-        drive_overlap(how, scans, spacing, store.sources()).require_none()
+        drive_overlap(how, scans, spacing, store.sources(), scans_per_point).require_none()
     plan = plan_localize(
         MapPlan.of_store(store, partial=partial),
         how,
@@ -108,6 +113,7 @@ def localize(
         registration=registration or LabelSettings().registration,
         starts=starts or StartSettings(),
         true_pose=true_pose,
+        scans_per_point=scans_per_point,
         scans=scans,
         starts_per_task=starts_per_task,
         memory=memory,
@@ -128,6 +134,7 @@ def plan_localize(
     registration: RegistrationSettings,
     starts: StartSettings,
     true_pose: TruePose,
+    scans_per_point: int = 1,
     scans: ScanSelection,
     starts_per_task: int | None,
     memory: int,
@@ -140,8 +147,10 @@ def plan_localize(
     registration.require_cells(cell_size)
     reading = _absolute(reading)
     log = opened(reading)
-    samples = choose_samples(log, scans, spacing)
-    measuring = Measuring(cell_size, true_pose, registration, starts, reading.as_sensor)
+    samples = choose_samples(log, scans, spacing, scans_per_point)
+    measuring = Measuring(
+        cell_size, true_pose, registration, starts, reading.as_sensor, scans_per_point
+    )
     for size in measuring.cell_sizes:
         map_plan.store.grid.require_cell_size(whole_mm(size, "cell_size"))
     state = reading.state
@@ -152,8 +161,7 @@ def plan_localize(
             f"{log.path}: {apart(map_plan, places[[sample.scan for sample in samples]], reach)}"
         )
     tasks: list[Task] = []
-    for first in range(0, len(samples), SCANS_PER_TASK):
-        part = samples[first : first + SCANS_PER_TASK]
+    for part in _slices(samples, max(1, SCANS_PER_TASK // scans_per_point)):
         tasks += slice_tasks(
             map_plan,
             tiles_in_reach(map_plan, places[[sample.scan for sample in part]], reach),
@@ -171,13 +179,28 @@ def _absolute(reading: Reading) -> Reading:
     return replace(reading, path=place_of(local_path(reading.path)))
 
 
-def choose_samples(log: ScanLog, scans: ScanSelection, spacing: float) -> tuple[Sample, ...]:
-    """One scan per `spacing` metres of the drive (`motion.along`): the one nearest to each multiple
-    of it.
+def _slices(samples: Sequence[Sample], points: int) -> Iterator[tuple[Sample, ...]]:
+    """The scans of so many sample points at a time."""
+    of_point = [tuple(scans) for _, scans in groupby(samples, lambda sample: sample.number)]
+    for first in range(0, len(of_point), points):
+        yield tuple(chain.from_iterable(of_point[first : first + points]))
+
+
+def choose_samples(
+    log: ScanLog, scans: ScanSelection, spacing: float, per_point: int = 1
+) -> tuple[Sample, ...]:
+    """The scans of the sample points of a drive, the sample points in their order.
+
+    A sample point is the scan nearest to a multiple of `spacing` [m] along the drive
+    (`motion.along`). With `per_point` it has up to so many scans: those nearest to it along the
+    drive within `BESIDE`, no scan at two sample points; the first is the sample point's own.
 
     Raises:
-        UsageError: `spacing` is not positive, or no scan with a pose is selected.
+        UsageError: `spacing` is not positive, `per_point` not 1 or more, or no scan with a pose is
+            selected.
     """
+    if per_point < 1:
+        raise UsageError(f"scans_per_point is {per_point}: give at least 1")
     if not 0.0 < spacing < np.inf:
         raise UsageError(f"spacing is {spacing!r}: give a positive length in metres")
     chosen = scans.indices(log.stamps_ns)
@@ -191,12 +214,43 @@ def choose_samples(log: ScanLog, scans: ScanSelection, spacing: float) -> tuple[
     rows = np.unique(np.where(nearer, after - 1, np.minimum(after, len(arc) - 1)))
     return tuple(
         Sample(number, int(chosen[row]), int(log.stamps_ns[chosen[row]]), float(arc[row]))
-        for number, row in enumerate(rows)
+        for number, of_point in enumerate(_beside(arc, rows, per_point))
+        for row in of_point
     )
 
 
+def _beside(arc: Float64, rows: Int64, per_point: int) -> Iterator[list[int]]:
+    """For each sample point its row, and the rows of the other scans that are taken there.
+
+    Args:
+        arc: (k,) of the scans along the drive, not falling [m].
+        rows: of the sample points, rising.
+        per_point: scans of a sample point, at most.
+    """
+    scans = np.arange(len(arc))
+    after = np.clip(np.searchsorted(rows, scans), 0, len(rows) - 1)
+    before = np.maximum(after - 1, 0)
+
+    def far(point: Int64) -> list[Any]:
+        return [np.abs(arc - arc[rows[point]]), np.abs(scans - rows[point])]
+
+    # of two sample points as near along the drive (where it stands) the one nearer in time
+    (one, one_steps), (other, other_steps) = far(before), far(after)
+    nearer = (one < other) | ((one == other) & (one_steps <= other_steps))
+    owner = np.where(nearer, before, after)
+    distance, steps = far(owner)
+    for point, row in enumerate(rows.tolist()):
+        own = np.flatnonzero((owner == point) & (distance <= BESIDE))
+        nearest = own[np.lexsort((own, steps[own], distance[own]))]
+        yield [row, *(scan for scan in nearest.tolist() if scan != row)][:per_point]
+
+
 def drive_overlap(
-    reading: Reading, scans: ScanSelection, spacing: float, sources: Iterable[Mapping[str, Any]]
+    reading: Reading,
+    scans: ScanSelection,
+    spacing: float,
+    sources: Iterable[Mapping[str, Any]],
+    per_point: int = 1,
 ) -> Overlap:
     """What the scans of a drive that are localized share with the sources of a map.
 
@@ -204,7 +258,7 @@ def drive_overlap(
         UsageError, SourceError: as `localize`.
     """
     log = opened(_absolute(reading))
-    samples = choose_samples(log, scans, spacing)
+    samples = choose_samples(log, scans, spacing, per_point)
     return overlap(log, [sample.scan for sample in samples], sources)
 
 
@@ -272,7 +326,7 @@ def slice_tasks(
         for cell_size in measuring.cell_sizes
         for tile in keys
     ]
-    work = len(scans.samples)
+    work = len(scans.samples)  # registrations; a label is one of a sample point
     registers = [
         Task(
             register,
@@ -291,7 +345,7 @@ def slice_tasks(
         Parquet(f"{folder}/errors/{name}.parquet"),
         takes={"samples": scans.samples},
         reads={"starts": tuple(task.product for task in registers)},
-        work=work,
+        work=scans.sample_points,
         counts={"rows": starts * len(scans.samples)},
     )
     return [*registers, summed]

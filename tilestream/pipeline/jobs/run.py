@@ -49,12 +49,14 @@ from tilestream.pipeline.jobs.run_inputs import (
 )
 from tilestream.pipeline.jobs.run_notes import (
     drives_measured,
+    log_poses_told,
     lost_labels,
     run_notes,
     with_logs,
 )
 from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
 from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
+from tilestream.pipeline.jobs.starts_of import starts_of
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.samples import DatasetFile
 from tilestream.report import write_report
@@ -287,7 +289,8 @@ def _report(settings: RunSettings, inputs: Inputs, story: _Story, book: Book) ->
     book.facts["drives"] = [drive.plain() for drive in measured]
     if not done.outputs("factors"):
         return
-    book.facts["notes"] = noticed(book.facts["notes"], heights_told(done, settings))
+    told = (heights_told(done, settings), log_poses_told(done))
+    book.facts["notes"] = noticed(book.facts["notes"], *told)
     known = done.dataset()
     if known is not None:
         book.facts |= {"labelled": len(known), "lost_labels": known.losses}
@@ -300,7 +303,12 @@ def _report(settings: RunSettings, inputs: Inputs, story: _Story, book: Book) ->
         seen_otherwise(settings, inputs.drives),
     )
     found = replace(
-        found, notes=book.facts["notes"], drives=measured, lost_labels=lost_labels(known)
+        found,
+        notes=book.facts["notes"],
+        drives=measured,
+        lost_labels=lost_labels(known),
+        cell_size=settings.cell_size,
+        ends=lambda group, sample: starts_of(settings.out, sample, group),
     )
     text = json.dumps(plain(evaluation), indent=1, allow_nan=False)
     write_text(settings.folder.under("tables/evaluation.json"), text + "\n")

@@ -26,6 +26,7 @@ from tilestream.pipeline.jobs.sources import map_notes
 from tilestream.pipeline.stages.drive_scans import opened
 from tilestream.pipeline.stages.label import label
 from tilestream.report.drives import DriveMeasured
+from tilestream.report.log_poses import note_of_log_poses
 from tilestream.store import TileStore
 
 NO_ROWS = pd.DataFrame({"status": [], "reason": []})
@@ -50,14 +51,16 @@ def with_logs(
     found = []
     for drive in inputs.drives:
         reading, scans, spacing = reading_of(drive), scans_of(drive), settings.spacing
+        several = settings.label.scans_per_point
         try:
-            log, shared = opened(reading), drive_overlap(reading, scans, spacing, sources)
+            log = opened(reading)
+            shared = drive_overlap(reading, scans, spacing, sources, several)
         except (SourceError, OSError):  # it is left out, see `plan_measure`
             continue
         if not settings.label.allow_overlap:
             shared.require_none()
         notes.append({drive.log: [*log.notes, *shared.notes]})
-        found.append(to_measure(drive.group, log, scans, spacing))
+        found.append(to_measure(drive.group, log, scans, spacing, several))
     return replace(inputs, notes=noticed(inputs.notes, *notes), to_measure=tuple(found))
 
 
@@ -80,15 +83,25 @@ def _on_degraded(settings: RunSettings, inputs: Inputs) -> list[str]:
 
 def drives_measured(inputs: Inputs, done: Done) -> tuple[DriveMeasured, ...]:
     """How much of each drive was measured."""
+    tables = _labels_by_drive(done)
+    return tuple(
+        with_labels(drive, tables.get(drive.drive, NO_ROWS)) for drive in inputs.to_measure
+    )
+
+
+def log_poses_told(done: Done) -> dict[str, list[str]]:
+    """How far the logs' poses are from refined ones, by drive."""
+    tables = _labels_by_drive(done)
+    return {f"drive {name}": note_of_log_poses(rows) for name, rows in tables.items()}
+
+
+def _labels_by_drive(done: Done) -> dict[str, pd.DataFrame]:
     tables: dict[str, list[pd.DataFrame]] = {}
     for task in done.outputs(label.name):
         assert isinstance(task.writes, Parquet)
         group = task.writes.path.rsplit("/", 2)[1]
         tables.setdefault(group, []).append(task.writes.read().rows)
-    return tuple(
-        with_labels(drive, pd.concat(tables.get(drive.drive, [NO_ROWS]), ignore_index=True))
-        for drive in inputs.to_measure
-    )
+    return {name: pd.concat(parts, ignore_index=True) for name, parts in tables.items()}
 
 
 def lost_labels(dataset: Dataset | None) -> list[dict[str, Any]]:

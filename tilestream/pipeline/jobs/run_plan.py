@@ -97,6 +97,7 @@ def _localized(
                 registration=settings.label.registration,
                 starts=settings.label.starts,
                 true_pose=settings.label.true_pose,
+                scans_per_point=settings.label.scans_per_point,
                 scans=scans_of(drive),
                 starts_per_task=None,
                 memory=settings.memory,

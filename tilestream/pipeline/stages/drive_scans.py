@@ -106,10 +106,10 @@ class Reading:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """A sample point of a drive: one scan of the log."""
+    """A scan of a sample point of a drive."""
 
     number: int
-    """Number along the drive."""
+    """Number of the sample point along the drive; of all its scans."""
     scan: int
     """Index of the scan in the log."""
     stamp_ns: int
@@ -120,13 +120,18 @@ class Sample:
 
 @dataclass(frozen=True)
 class DriveScans:
-    """Some scans of a drive, one per sample point."""
+    """Some scans of a drive, all of each sample point, the nearest to it first."""
 
     reading: Reading
     state: str
     """Of the log and of how it is read (`Reading.state`)."""
     samples: tuple[Sample, ...]
     makers: tuple[str, ...] = ()
+
+    @property
+    def sample_points(self) -> int:
+        """How many sample points they are of."""
+        return len({sample.number for sample in self.samples})
 
     @property
     def identity(self) -> str:

@@ -12,6 +12,8 @@ from tilestream.pipeline.stages.drive_scans import Sample
 from tilestream.pipeline.stages.register import SCAN_COLUMNS
 from tilestream.records import Column
 
+OFF_LOG = "log - refined; NaN where the true pose is the log's"
+"""What the offsets of the log's poses are."""
 ERROR_COLUMNS = (
     *SCAN_COLUMNS,
     Column("x", "place", "m", "True position of the lidar in the map.", "see true_pose"),
@@ -22,8 +24,20 @@ ERROR_COLUMNS = (
     Column("arc_length", "place", "m", "Length of the drive up to here.", "of the log's poses"),
     Column("true_pose", "label", "", "log or refined.", "definitions, section 5", dtype="str"),
     Column("as_sensor", "label", "", "As if by which sensor the log was read.", "", dtype="str"),
-    Column("points", "label", "1", "Scan points that were registered, thinned.", "", dtype="int64"),
-    Column("starts", "label", "1", "Number of starts.", "", dtype="int64"),
+    Column("log_along", "place", "m", "Of the log's pose along the true heading.", OFF_LOG),
+    Column("log_across", "place", "m", "Of the log's pose across it, left positive.", OFF_LOG),
+    Column("log_up", "place", "m", "Of the log's pose in map z.", OFF_LOG),
+    Column("log_yaw", "place", "rad", "Of the log's heading, in [-pi, pi).", OFF_LOG),
+    Column("points", "label", "1", "Points of a scan as registered, thinned.", "", dtype="int64"),
+    Column("starts", "label", "1", "Number of starts, of all scans.", "", dtype="int64"),
+    Column("scans", "label", "1", "Scans that were measured here.", "", dtype="int64"),
+    Column(
+        "scan_spread",
+        "label",
+        "m",
+        "Standard deviation of the mean error between the scans; NaN of one scan.",
+        "definitions, section 5",
+    ),
     Column("converged", "label", "1", "Share of starts that converged.", ""),
     Column("iterations", "label", "1", "Mean number of Newton steps.", ""),
     Column("nvtl", "label", "1", "Mean NVTL at the end.", "Autoware"),
@@ -41,6 +55,8 @@ ERROR_COLUMNS = (
     Column("along_mean", "label", "m", "Mean of abs(along).", ""),
     Column("across_mean", "label", "m", "Mean of abs(across).", ""),
     Column("up_mean", "label", "m", "Mean of abs(up).", ""),
+    Column("roll_mean", "label", "rad", "Mean of abs(roll).", ""),
+    Column("pitch_mean", "label", "rad", "Mean of abs(pitch).", ""),
     Column("yaw_mean", "label", "rad", "Mean of abs(yaw).", ""),
     Column(
         "error_floor",
@@ -63,7 +79,7 @@ BYTES_PER_ROW = 600
 
 @stage(
     "label",
-    version=3,
+    version=4,
     memory=lambda counts: FIXED_BYTES + BYTES_PER_ROW * counts["rows"],
     seconds=0.006,
     columns=ERROR_COLUMNS,
@@ -73,27 +89,35 @@ def label(starts: Sequence[Stored], samples: Sequence[Sample]) -> Made:
 
     Args:
         starts: the starts of each batch, with what is true of all starts of a scan.
-        samples: the sample points.
+        samples: the scans of the sample points.
     """
     frame = pd.concat([part.rows for part in starts], ignore_index=True)
     facts: dict[str, dict[str, Any]] = {}
     for part in starts:
-        for number, fact in part.facts["samples"].items():  # the first batch that failed decides
-            facts[number] = fact | {"reason": facts.get(number, fact)["reason"] or fact["reason"]}
+        for scan, fact in part.facts["scans"].items():  # the first batch that failed decides
+            facts[scan] = fact | {"reason": facts.get(scan, fact)["reason"] or fact["reason"]}
     data_set = starts[0].facts["data_set"]
-    rows = [_row(sample, facts[str(sample.number)], data_set, frame) for sample in samples]
+    points: dict[int, list[tuple[Sample, dict[str, Any]]]] = {}
+    for sample in samples:
+        points.setdefault(sample.number, []).append((sample, facts[str(sample.scan)]))
+    rows = [_row(scans, data_set, frame) for scans in points.values()]
     names = {column.name: column.dtype for column in ERROR_COLUMNS}
     labels = pd.DataFrame(rows).reindex(columns=list(names)).astype(names)
     return Made(labels, {"data_set": data_set})
 
 
 def _row(
-    sample: Sample, fact: dict[str, Any], data_set: dict[str, Any], starts: pd.DataFrame
+    scans: Sequence[tuple[Sample, dict[str, Any]]], data_set: dict[str, Any], starts: pd.DataFrame
 ) -> dict[str, Any]:
-    """The row of a sample point."""
+    """The row of a sample point from its scans, the nearest first; without those that failed, as
+    long as one did not.
+    """
+    good = [(sample, fact) for sample, fact in scans if not fact["reason"]]
+    sample, fact = (good or scans)[0]
     row: dict[str, Any] = {
         "points": 0,
         "starts": 0,
+        "scans": len(good),
         "sample": sample.number,
         "scan": sample.scan,
         "stamp_ns": sample.stamp_ns,
@@ -103,18 +127,21 @@ def _row(
         "as_sensor": data_set["as_sensor"],
         **fact,
     }
-    if not fact["reason"]:
-        row |= _summed(starts[starts["sample"] == sample.number])
+    if good:
+        own = [sample.scan for sample, _ in good]
+        row |= _summed(starts[starts["scan"].isin(own)])
+        row["points"] = round(sum(fact["points"] for _, fact in good) / len(good))
     return row
 
 
 def _summed(starts: pd.DataFrame) -> dict[str, float]:
-    """The label of one sample point from the rows of its starts."""
-    starts = starts.sort_values("start")
-    names = ("along", "across", "up", "yaw", "error")
+    """The label of one sample point from the rows of the starts of all its scans."""
+    starts = starts.sort_values(["scan", "start"])
+    names = ("along", "across", "up", "roll", "pitch", "yaw", "error")
     errors = {name: starts[name].to_numpy() for name in names}
     return {
         "starts": len(starts),
+        "scan_spread": float(starts.groupby("scan")["error"].mean().std()),
         "converged": float(starts["converged"].mean()),
         "iterations": float(starts["iterations"].mean()),
         "nvtl": float(starts["nvtl"].mean()),

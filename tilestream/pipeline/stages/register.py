@@ -31,6 +31,8 @@ FIXED_BYTES = 300_000_000
 BYTES_PER_POINT = 30
 """Memory per map point in sight of the slice, of which the cells are held twice."""
 
+ROTATION = "component of w, Exp(w) = R_final R_true^T"
+"""What the components of a rotation error are of."""
 SCAN_COLUMNS = (
     Column(
         "sample", "place", "1", "Number of the sample point along the drive.", "", dtype="int64"
@@ -49,6 +51,9 @@ START_COLUMNS = (
     ),
     Column("across", "label", "m", "Error across the true heading, left positive.", "final - true"),
     Column("up", "label", "m", "Error in map z.", "final - true"),
+    Column("roll", "label", "rad", "Rotation error along the true heading.", ROTATION),
+    Column("pitch", "label", "rad", "Rotation error across the true heading.", ROTATION),
+    Column("yaw_vector", "label", "rad", "Rotation error in map z.", ROTATION),
     Column("yaw", "label", "rad", "Error of the heading, in [-pi, pi).", "final - true"),
     Column("error", "label", "m", "3D error.", "norm of along, across, up"),
     Column("converged", "label", "1", "Whether the last step was below epsilon.", "", dtype="bool"),
@@ -59,6 +64,10 @@ START_COLUMNS = (
     ),
     Column("hits", "label", "1", "Scan points with a cell at the end.", "", dtype="int64"),
 )
+
+
+OF_LOG = ("along", "across", "up", "yaw")
+"""What is kept of how far the log's pose is from a refined one."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +84,8 @@ class Measuring:
     """The starts."""
     as_sensor: str
     """As if by which sensor the log was read."""
+    scans_per_point: int = 1
+    """Scans of a sample point, at most."""
 
     @property
     def cell_sizes(self) -> tuple[float, ...]:
@@ -85,7 +96,7 @@ class Measuring:
 
 @stage(
     "register",
-    version=3,
+    version=4,
     memory=lambda counts: FIXED_BYTES + BYTES_PER_POINT * counts["points"],
     seconds=0.45,
     columns=START_COLUMNS,
@@ -102,10 +113,10 @@ def register(
         batch: first and last (exclusive) start.
     """
     rows: list[pd.DataFrame] = [NO_ROWS]
-    facts: dict[str, dict[str, Any]] = {}
+    facts: dict[str, dict[str, Any]] = {}  # by the number of the scan
     heights = _lidar_heights(map_part, scans)
     for (sample, scan), height in zip(scans, heights, strict=True):
-        place: dict[str, float | None] = {"lidar_height": height}
+        place: dict[str, float | None] = {"sample": sample.number, "lidar_height": height}
         if measuring.true_pose == "log":
             place |= _place(scan.T_map_lidar)
         try:
@@ -113,16 +124,16 @@ def register(
             T_map_true = _true_pose(map_part, seen, measuring)
             found, points = _registered(map_part, seen, T_map_true, measuring, batch)
         except (RegistrationError, PoseError, UsageError, TileNotReadyError) as error:
-            facts[str(sample.number)] = place | {"reason": str(error)}
+            facts[str(sample.scan)] = place | {"reason": str(error)}
         else:
             which = {"sample": sample.number, "scan": sample.scan, "stamp_ns": scan.stamp_ns}
             rows.append(found.assign(**which))
-            place |= _place(T_map_true)
-            facts[str(sample.number)] = place | {"points": points, "reason": ""}
+            place |= _place(T_map_true) | _off_log(scan, T_map_true, measuring)
+            facts[str(sample.scan)] = place | {"points": points, "reason": ""}
     names = {column.name: column.dtype for column in START_COLUMNS}
     frame = pd.concat(rows, ignore_index=True)[list(names)].astype(names)
     known = {"data_set": canonical(measuring), "store": map_part.store.address}
-    return Made(frame, {**known, "samples": facts})
+    return Made(frame, {**known, "scans": facts})
 
 
 def _registered(
@@ -150,6 +161,15 @@ def _place(T_map_true: Float64 | None) -> dict[str, float]:
     assert T_map_true is not None  # a drive's scans have a pose
     x, y, z = T_map_true[:3, 3].tolist()
     return {"x": x, "y": y, "z": z, "heading": math.atan2(T_map_true[1, 0], T_map_true[0, 0])}
+
+
+def _off_log(scan: Scan, T_map_true: Float64, measuring: Measuring) -> dict[str, float]:
+    """How far the log's pose is from a refined true pose, in its frame; else nothing."""
+    if measuring.true_pose == "log":
+        return {}
+    assert scan.T_map_lidar is not None  # a drive's scans have a pose
+    off = start_errors(T_map_true, scan.T_map_lidar[None])
+    return {f"log_{name}": float(off[name][0]) for name in OF_LOG}
 
 
 def _lidar_heights(map_part: MapPart, scans: OpenedScans) -> list[float | None]:
