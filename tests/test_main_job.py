@@ -194,7 +194,7 @@ def test_the_page_says_what_makes_the_same_figures_again(done: tuple[Path, Told]
     assert facts["cores"] == os.cpu_count()
     assert facts["wall time, all calls [s]"] > 0.0
     model = facts["model"]
-    assert (model["from"], model["recipe"], model["trees"]) == ("trained here", "default", 4)
+    assert (model["from"], model["recipe"], model["trees"]) == ("trained here", "forest", 4)
     assert (model["seed"], model["points"]) == (0, len(STREETS) * SCANS)
     effective = yaml.safe_load((done[0] / "config.yaml").read_text())
     assert facts["settings"] | {"out": str(done[0]), "drives": effective["drives"]} == effective
@@ -207,7 +207,7 @@ def test_the_evaluation_has_every_protocol_and_opponent(done: tuple[Path, Told])
     found = json.loads((done[0] / "tables" / "evaluation.json").read_text())
     protocols = pd.DataFrame(found["protocols"])
     judged = protocols[protocols["reason"] == ""]
-    assert set(judged["model"]) == set(registry.COMPETITORS) - {registry.UNTRAINED}
+    assert set(judged["model"]) == set(registry.COMPETITORS) - set(registry.OF_VIRTUAL_DRIVES)
     assert {"paper", "path"} <= set(judged["protocol"])
     assert set(protocols["protocol"]) == {"paper", "path", "blocks"}
     blocks = protocols[protocols["protocol"] == "blocks"]
@@ -219,7 +219,7 @@ def test_the_evaluation_has_every_protocol_and_opponent(done: tuple[Path, Told])
     assert sets == {"FS", "FS+RQ", "FS+RQ+LY", "FS+RQ+LY+LS", "all + robust"}
     parts = pd.DataFrame(found["parts"])
     assert set(parts["target"]) == set(TARGETS) - {"error_mean"}
-    assert set(parts["model"]) == {"default", "training median"}
+    assert set(parts["model"]) == {"forest", "training median"}
     on_paths = parts[parts["protocol"] == "path"].set_index("target")
     assert on_paths.loc["error_tail", "reason"].str.contains("nothing to learn").all()
     assert (on_paths.drop("error_tail")["mae"] >= 0.0).all()  # all starts here are within 1 m
@@ -229,7 +229,7 @@ def test_the_evaluation_has_every_protocol_and_opponent(done: tuple[Path, Told])
 def test_held_out_estimates_stand_beside_the_labels(done: tuple[Path, Told]) -> None:
     report = json.loads((done[0] / "report" / "report.json").read_text())
     assert {path["path"] for path in report["paths"]} == set(STREETS)
-    held = pd.read_parquet(done[0] / "tables" / "judged" / "error_mean-default-all.parquet")
+    held = pd.read_parquet(done[0] / "tables" / "judged" / "error_mean-forest-all.parquet")
     part = held[held["protocol"] == "path"]
     assert len(part) == len(STREETS) * SCANS
     for fold, rows in part.groupby("fold"):
@@ -351,9 +351,9 @@ def the_recipe_in_use_is_evaluated(folder: Path, recipe: str) -> None:
     for path in report["paths"]:
         here = judged[judged["path"] == path["path"]]
         assert path["mae"] == pytest.approx((here["actual"] - here["estimate"]).abs().mean())
-    expected = coverage(judged).set_index("path")["factor"]
-    factors = {row["path"]: row["factor"] for row in report["coverage"]}
-    assert factors == pytest.approx(expected.to_dict())
+    expected = coverage(judged).set_index("path")["width"]
+    widths = {row["path"]: row["width"] for row in report["coverage"]}
+    assert widths == pytest.approx(expected.to_dict(), nan_ok=True)
     page = html.unescape((folder / "report" / "index.html").read_text())
     assert re.search(rf"The model of these estimates \([\d.]+.cm, {MODELS[recipe]}\)", page)
 

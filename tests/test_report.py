@@ -107,7 +107,7 @@ def test_each_path_is_judged_by_what_was_held_out(found: Findings, folder: Path)
         here["held_out"].rank().corr(here["error_mean"].rank()), abs=1e-9
     )
     assert one["groups"] == ["morning", "noon"]
-    assert (one["factor"], two["factor"]) == (2.5, None)
+    assert (one["interval"], two["interval"]) == (True, False)
 
 
 def test_geoparquet_is_read_by_its_own_rules(found: Findings, folder: Path) -> None:

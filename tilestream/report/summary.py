@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from tilestream.model.evaluation import PAPER_TABLE, figures
+from tilestream.model.evaluation import PAPER_TABLE
+from tilestream.model.figures import figures
 from tilestream.model.training import PREDICTION_COLUMNS
 from tilestream.records import Float64, Int64
 from tilestream.report.data import PLACE_COLUMNS, Findings, estimates, like_training
 from tilestream.report.formatting import cm, distance, known, percent, thousands
-from tilestream.report.lines import held_out_along, interval_factor
 from tilestream.report.segments import reaches, segments, worst_places
 from tilestream.version import VERSION
 
@@ -47,6 +47,7 @@ def summary(found: Findings, threshold: float) -> dict[str, Any]:
         "criterion_importances": found.criterion_importances.to_dict("records"),
         "coverage": found.coverage.to_dict("records"),
         "parts": found.parts.to_dict("records"),
+        "differences": found.differences.to_dict("records"),
         "ceilings": found.ceilings,
         "model": found.model,
         "facts": found.facts,
@@ -181,14 +182,12 @@ def paths(found: Findings) -> list[dict[str, Any]]:
     for name, part in found.labels.groupby("path", sort=True):
         actual, held = (part[c].to_numpy(np.float64) for c in ("error_mean", "held_out"))
         evaluated = np.isfinite(actual) & np.isfinite(held)
-        factor = interval_factor(found.coverage, str(name))
         row = {
             "path": str(name),
             "points": len(part),
             "groups": sorted(set(part["group"].astype(str))),
             "judged": int(evaluated.sum()),
-            "factor": factor,
-            "interval": bool(held_out_along(part, factor)["low"].notna().any()),
+            "interval": bool(part["low"].notna().any()),
             "actual_median": float(np.nanmedian(actual)),
             "estimate_median": float(np.median(held[evaluated])) if evaluated.any() else None,
             "mae": None,
