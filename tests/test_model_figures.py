@@ -160,6 +160,7 @@ def test_the_limit_is_the_skill_of_the_truth(count: int) -> None:
 def test_a_repeated_drive_by_hand() -> None:
     factors, labels = drives(1, {"a": 200})
     again = labels.assign(error_mean=labels["error_mean"] + 0.01)
+    lesser = again.assign(as_sensor="16beams")
     both = joined(factors, {"one": labels, "two": again}, COLUMNS)
     found = repeated(both)
     assert found["points"] == 400
@@ -169,8 +170,9 @@ def test_a_repeated_drive_by_hand() -> None:
     ratio = 0.01 / np.abs(both.label() - median).mean()
     assert found["limit"] == pytest.approx(1.0 - ratio / np.sqrt(2.0))
     assert np.isnan([found["limit_low"], found["skill_low"]]).all()  # one block
-    with pytest.raises(ModelError, match="no place was driven twice"):
-        repeated(both.groups(["one"]))
+    for lone in (both.groups(["one"]), joined(factors, {"one": labels, "two": lesser}, COLUMNS)):
+        with pytest.raises(ModelError, match="no place was driven twice"):
+            repeated(lone)
 
 
 def test_places_that_fewer_drives_know_count_as_they_are() -> None:

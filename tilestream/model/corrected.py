@@ -13,14 +13,14 @@ from tilestream.errors import ModelError
 from tilestream.model.dataset import Dataset, matrix
 from tilestream.model.physics import Physics, possible
 from tilestream.model.regressor import Kind, Regressor
-from tilestream.model.splits import block_splits
+from tilestream.model.splits import nested_splits
 from tilestream.model.trees import TREE_TYPES, Float32, added_by_factors, leads_somewhere, sum_of
 from tilestream.records import Column, Float64
 
 WEIGHTS = (0.25, 0.5, 0.75, 1.0)
 """Shares of the correction that are tried besides 0."""
-NESTED = 3
-"""Folds in which the share is chosen."""
+NESTED = 4
+"""Folds of paths, or of blocks, in which the share is chosen."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Corrected(Regressor):
     """Physics + weight x correction.
 
     The correction is gradient boosting on the absolute error of physics. Its weight is chosen for
-    each target on blocks held out of the training places, and is 0 unless it pays there.
+    each target on paths held out of the training places, and is 0 unless it pays there.
     """
 
     name = "corrected"
@@ -182,11 +182,11 @@ def _fill_inner_nodes(tree: Any) -> None:
 
 
 def _weight_that_pays(dataset: Dataset, target: str, boosting: Boosting, seed: int) -> float:
-    """The share of the correction that lowers the error of held-out blocks most, every block
+    """The share of the correction that lowers the error of held-out paths most, every block of them
     weighing the same; 0 where no share lowers it by more than one standard error over the blocks.
     """
     try:
-        splits = block_splits(dataset, NESTED)
+        splits = nested_splits(dataset, NESTED)
     except ModelError:
         return 0.0
     label = dataset.label(target)

@@ -22,7 +22,8 @@ def repeated(dataset: Dataset, target: str = "error_mean") -> dict[str, float]:
     errors of the means of 1, 2, … drives are fitted by that (least squares), and `limit` is the
     skill where m has no end.
 
-    Every label is compared with the nearest of each other drive, at most 0.5 m away along the path.
+    Every label is compared with the nearest of each other drive, at most 0.5 m away along the path;
+    a drive that is read as another lidar is none.
     The median of the skill is that of all labels.
 
     Returns:
@@ -58,16 +59,17 @@ def _of_other_drives(dataset: Dataset, target: str) -> tuple[pd.DataFrame, Float
     """The labelled places (`actual` is the label), and (n, drives) what each other drive has there;
     NaN where it has nothing, and for the drive itself.
     """
-    here = dataset.rows[["path", "block", "arc_length", "group", target]]
+    here = dataset.rows[["path", "block", "arc_length", "group", "as_sensor", target]]
     here = here.rename(columns={target: "actual"})
     names = sorted(here["group"].unique())
     labels = np.full((len(here), len(names)), np.nan)
     for k, name in enumerate(names):
         own = (here["group"] == name).to_numpy()
         drive = here.loc[own, ["path", "arc_length", "actual"]].rename(columns={"actual": "again"})
-        if not own.all():
-            found = nearest_along(here[~own], drive, SAME_PLACE)
-            labels[~own, k] = found["again"].to_numpy(np.float64)
+        others = ~own & here["as_sensor"].isin(here.loc[own, "as_sensor"]).to_numpy()
+        if others.any():
+            found = nearest_along(here[others], drive, SAME_PLACE)
+            labels[others, k] = found["again"].to_numpy(np.float64)
     return here, labels
 
 
@@ -102,5 +104,6 @@ def _limit(errors: Float64, of_median: Float64) -> Float64:
         ratio = errors / of_median
     there = np.isfinite(ratio)
     fitted = (np.where(there, ratio, 0.0) * expected).sum(axis=1)
-    limit: Float64 = 1.0 - fitted / (there * expected**2).sum(axis=1)
+    with np.errstate(invalid="ignore"):
+        limit: Float64 = 1.0 - fitted / (there * expected**2).sum(axis=1)
     return limit

@@ -77,8 +77,27 @@ def block_splits(dataset: Dataset, folds: int = FOLDS, buffer: float = BUFFER) -
     names = np.unique(blocks)
     if len(names) < 2:
         raise ModelError(f"one block only ({names[0]}): the drive is too short to be divided")
+    return _dealt(dataset, blocks, folds, buffer)
+
+
+def nested_splits(dataset: Dataset, folds: int) -> list[Split]:
+    """Splits of what trains: whole paths dealt in turn into folds, as an unseen street is what has
+    to be estimated; of fewer than three paths, blocks.
+
+    Raises:
+        ModelError: a single block, or too few points left to train.
+    """
+    paths = dataset.rows["path"].to_numpy(str)
+    if len(np.unique(paths)) < 3:
+        return block_splits(dataset, folds)
+    return _dealt(dataset, paths, folds, BUFFER)
+
+
+def _dealt(dataset: Dataset, units: NDArray[np.str_], folds: int, buffer: float) -> list[Split]:
+    """Units, by (n,) names, dealt in turn into folds."""
+    names = np.unique(units)
     folds = min(folds, len(names))
-    fold = np.searchsorted(names, blocks) % folds
+    fold = np.searchsorted(names, units) % folds
     return [_held_out(dataset, f"fold {k}", fold == k, buffer) for k in range(folds)]
 
 
