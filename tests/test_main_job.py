@@ -35,12 +35,13 @@ from tilestream.errors import (
     UsageError,
 )
 from tilestream.files import Files
+from tilestream.factors.along_route import averaged_along
 from tilestream.model import evaluation, forest, registry, training
 from tilestream.model.dataset import TARGETS
 from tilestream.model.file import load_model, save_model
 from tilestream.model.forest import Growth, PaperForest
 from tilestream.model.intervals import coverage
-from tilestream.model.training import PREDICTION_COLUMNS
+from tilestream.model.training import PREDICTION_COLUMNS, predict
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.cluster import dask_client
 from tilestream.pipeline.engine.costs import calibration_file, core_hours, learn
@@ -478,7 +479,8 @@ def test_the_thinning_of_a_map_that_is_there_counts(
 
 def test_observability_joins_the_factors(inputs: Path, copy: Path) -> None:
     told = Told()
-    ts.run(job(inputs, copy, observe={"range_max": 14.0}), watch=told)
+    model = {"recipe": "corrected"}
+    ts.run(job(inputs, copy, observe={"range_max": 14.0}, model=model), watch=told)
     assert {"surfels", "observe"} <= {outcome.stage for outcome in told.outcomes}
     assert told.worked() == set(LEARNT)
     dataset = ts.dataset(copy)
@@ -493,6 +495,19 @@ def test_observability_joins_the_factors(inputs: Path, copy: Path) -> None:
     assert own["used"] == list(load_model(copy / "model.skops").factors)
     assert own["paper"] == [c.name for c in dataset.columns if c.factor_set == "faithful"]
     assert "physics" in {row["model"] for row in found["protocols"]}
+    report = json.loads((copy / "report" / "report.json").read_text())
+    assert report["model"] == "corrected"
+    assert {row["model"] for row in report["parts"]} == {"corrected", "physics", "training median"}
+    compared = {(row["target"], row["protocol"]) for row in found["differences"]}
+    assert {("error_mean", "path"), ("across_mean", "path")} <= compared
+    used = load_model(copy / "model.skops")
+    assert report["facts"]["model"]["averaged along the route over [m]"] == used.width
+    seen = pd.concat(map(pd.read_parquet, (copy / "tables" / "observability").glob("*.parquet")))
+    seen = averaged_along(seen.reset_index(drop=True), used.width).set_index(["route_id", "sample"])
+    places = pd.read_parquet(copy / "report" / "places.parquet").set_index(["route_id", "sample"])
+    np.testing.assert_array_equal(places["vd_mean"], seen.loc[places.index, "vd_mean"])
+    again = predict(used, places)
+    pd.testing.assert_series_equal(again["estimate"], places["estimate"], check_exact=True)
 
 
 def test_nothing_is_learnt_or_estimated_without_the_virtual_drive_that_was_asked_for(
@@ -553,9 +568,27 @@ def test_physics_needs_no_drive(inputs: Path, tmp_path: Path) -> None:
     assert middle["tunnel"] > 1.5 * middle["canyon"]  # nothing holds a scan along a tunnel
 
 
-def test_physics_without_a_virtual_drive_is_refused(inputs: Path, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="needs observe"):
-        job(inputs, tmp_path / "run", model={"recipe": "physics"})
+def test_physics_of_a_short_drive_is_the_virtual_drive_as_it_is_and_says_so(
+    inputs: Path, tmp_path: Path
+) -> None:
+    """With 26 places nothing is fitted, and what was measured stands beside the estimates."""
+    drives = [{"log": str(inputs / "canyon.mcap")}]
+    seeing = {"range_max": 14.0, "starts": 8}
+    model = {"recipe": "physics"}
+    ts.run(job(inputs, tmp_path / "run", drives=drives, observe=seeing, model=model))
+    told = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert any("26 places are measured" in note for note in told["notes"]["job"])
+    places = pd.read_parquet(tmp_path / "run" / "report" / "places.parquet")
+    assert (places["estimate"] == places["vd_mean"]).all()
+    report = json.loads((tmp_path / "run" / "report" / "report.json").read_text())
+    assert report["paths"][0]["judged"] == 26
+    assert "train" not in told["stages"]
+
+
+def test_what_needs_a_virtual_drive_is_refused_without(inputs: Path, tmp_path: Path) -> None:
+    for recipe in ("physics", "corrected"):
+        with pytest.raises(UsageError, match=f"{recipe}, which needs observe.*paper, forest"):
+            job(inputs, tmp_path / "run", model={"recipe": recipe})
 
 
 # --- The settings
