@@ -1,4 +1,4 @@
-"""Labels of the simulated paths: Table I, what each knob moves, and what a second drive knows of them.
+"""Labels of the simulated paths: Table I, what each knob moves, and what a second drive knows.
 
     python benchmarks/shinjuku_labels.py [--preset paper] [--out FOLDER] [--every 10] [--workers 1]
     python benchmarks/shinjuku_labels.py --drives 0 1     # two drives of every path

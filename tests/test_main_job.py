@@ -34,8 +34,8 @@ from tilestream.errors import (
     SourceNotFoundError,
     UsageError,
 )
-from tilestream.files import Files
 from tilestream.factors.along_route import averaged_along
+from tilestream.files import Files
 from tilestream.model import evaluation, forest, registry, training
 from tilestream.model.dataset import TARGETS
 from tilestream.model.file import load_model, save_model

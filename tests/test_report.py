@@ -414,7 +414,7 @@ def test_bad_findings_are_refused(tmp_path: Path) -> None:
         Findings("t", places.iloc[:0])
     with pytest.raises(UsageError, match="route 'a' has sample 0 twice"):
         Findings("t", pd.concat([places, places.iloc[:1]]))
-    with pytest.raises(UsageError, match="labels: no column group, held_out"):
+    with pytest.raises(UsageError, match="labels: no column group, block, held_out"):
         Findings(
             "t", places, labels=pd.DataFrame({"path": ["a"], "arc_length": 0, "error_mean": 1})
         )

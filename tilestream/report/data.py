@@ -17,7 +17,7 @@ from tilestream.report.drives import DriveMeasured
 
 PLACE_COLUMNS = ("route_id", "sample", "arc_length", "heading", "x", "y", "z")
 """Where a sample point is: its route, its number there, and the map frame [m, rad]."""
-LABEL_COLUMNS = ("group", "path", "arc_length", "error_mean", "held_out", "low", "high")
+LABEL_COLUMNS = ("group", "path", "block", "arc_length", "error_mean", "held_out", "low", "high")
 """What a labelled place must have."""
 AROUND = 40.0
 """How far round a place its picture reaches [m]."""

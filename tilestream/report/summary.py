@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from tilestream.model.evaluation import PAPER_TABLE
-from tilestream.model.figures import figures
+from tilestream.model.figures import with_spans
 from tilestream.model.training import PREDICTION_COLUMNS
 from tilestream.records import Float64, Int64
 from tilestream.report.data import PLACE_COLUMNS, Findings, estimates, like_training
@@ -18,6 +18,8 @@ from tilestream.version import VERSION
 
 THRESHOLDS = (0.05, 0.10, 0.15, 0.20, 0.25, 0.50)
 """Errors that people ask for [m]: the paper's Table I, and around them."""
+OF_PATH = ("mae", "spearman", "spearman_low", "spearman_high")
+"""How the estimates of a labelled path are told."""
 AXES, STARTS = ("along", "across", "up"), ("floor", "tail")
 """The parts of an estimate [m]: by direction; of the starts nearby, and what farther ones add."""
 
@@ -190,13 +192,12 @@ def paths(found: Findings) -> list[dict[str, Any]]:
             "interval": bool(part["low"].notna().any()),
             "actual_median": float(np.nanmedian(actual)),
             "estimate_median": float(np.median(held[evaluated])) if evaluated.any() else None,
-            "mae": None,
-            "spearman": None,
+            **dict.fromkeys(OF_PATH),
         }
         if evaluated.any():
-            median = np.full(int(evaluated.sum()), np.median(actual[evaluated]))
-            of = figures(actual[evaluated], held[evaluated], median)
-            row |= {"mae": of.mae, "spearman": of.spearman}
+            here = part[evaluated].rename(columns={"error_mean": "actual", "held_out": "estimate"})
+            of = with_spans(here.assign(median=here["actual"].median(), fold=""))
+            row |= {name: of[name] for name in OF_PATH}
         rows.append(row)
     return rows
 
