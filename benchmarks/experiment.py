@@ -56,12 +56,23 @@ def figures(row: Any) -> list[str]:
     lengths = [f"{CM * row[name]:.2f}" for name in ("rmse", "mae")]
     shares = [f"{CM * row[name]:.1f} %" for name in ("within_25mm", "within_50mm")]
     rest = [
-        "" if pd.isna(row.get(name)) else f"{row[name]:.2f}" for name in ("r2", "skill", "spearman")
+        spanned(row, name)
+        for name in ("r2", "skill", "spearman", "segment_skill", "segment_spearman")
     ]
     return [*lengths, *shares, *rest]
 
 
+def spanned(row: Any, name: str) -> str:
+    """A figure, with its 90 % interval where there is one."""
+    if pd.isna(row.get(name)):
+        return ""
+    ends = [row.get(f"{name}_{end}") for end in ("low", "high")]
+    span = "" if any(map(pd.isna, ends)) else f" ({ends[0]:.2f} to {ends[1]:.2f})"
+    return f"{row[name]:.2f}{span}"
+
+
 FIGURES = ["RMSE", "MAE", "< 2.5 cm", "< 5 cm", "R^2", "skill", "Spearman"]
+FIGURES += ["skill, 12 m", "Spearman, 12 m"]
 
 
 def table_four(evaluation: dict[str, Any]) -> str:
@@ -88,7 +99,11 @@ def table_protocols(evaluation: dict[str, Any], target: str = "error_mean") -> s
             [TITLES[str(protocol)], str(r["model"]), *figures(r)] for _, r in ranked.iterrows()
         ]
     if target in evaluation["ceilings"]:
-        lines.append(["", "a repeated drive", *figures(evaluation["ceilings"][target])])
+        known = evaluation["ceilings"][target]
+        blank = [""] * len(FIGURES)
+        blank[FIGURES.index("skill")] = spanned(known, "limit")
+        lines.append(["", "a repeated drive", *figures(known)])
+        lines.append(["", "the mean of all drives there could be", *blank])
     return markdown(lines, ["protocol", "model", *FIGURES])
 
 
@@ -137,15 +152,18 @@ def main(given: argparse.Namespace) -> None:
     coverage = pd.DataFrame(evaluation["coverage"])
     lines = [
         [
-            str(r.path),
+            str(r.path) or "all",
             str(r.points),
             f"{CM * r.level:.0f} %",
             f"{CM * r.covered:.0f} %",
-            f"{r.factor:.2f}",
+            f"{CM * r.width:.1f}",
         ]
         for r in coverage.itertuples()
     ]
-    print("## Intervals\n\n" + markdown(lines, ["path", "points", "promised", "covered", "factor"]))
+    print(
+        "## Intervals\n\n"
+        + markdown(lines, ["path", "points", "promised", "covered", "mean width [cm]"])
+    )
     print(f"\n## Cost\n\n{table_cost(run)}\n\n{run['seconds']:.0f} s in all")
 
 

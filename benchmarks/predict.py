@@ -46,7 +46,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 import numpy as np
 import pandas as pd
-from model_data import COLUMNS, LENGTHS, dataset, drives
+from model_data import LENGTHS, dataset, with_virtual_drives
 
 from tilestream.files import Files
 from tilestream.grid import TileKey
@@ -82,12 +82,12 @@ def measure(recipe: str, rows: int, share: float, file: Path) -> dict[str, float
     """Figures of one regressor, trained on the first part of each path."""
     lengths = {path: round(share * metres) for path, metres in LENGTHS.items()}
     begin = time.process_time()
-    save_model(train(dataset(0, lengths=lengths), recipe=recipe), file)
+    save_model(train(with_virtual_drives(dataset(0, lengths=lengths)), recipe=recipe), file)
     trained = time.process_time() - begin
     model = load_model(file)
-    some = drives(1, {"a": 2000})[0]
+    some = with_virtual_drives(dataset(1, lengths={"a": 2000})).rows
     table = pd.concat([some] * -(-rows // len(some)), ignore_index=True).iloc[:rows]
-    X = table[[column.name for column in COLUMNS]].to_numpy(np.float64)
+    X = table[list(model.factors)].to_numpy(np.float64)
     regressor, few = model.regressors["error_mean"], table[: rows // 10]
     return {
         "recipe": recipe,
@@ -155,7 +155,7 @@ def district(run_dir: Path) -> dict[str, float | str]:
 
         def read(task: Task) -> pd.DataFrame:
             what = task.arguments()
-            return places_with_factors([what["factors"]], what["observed"])
+            return places_with_factors([what["factors"]], what["observed"], model.width)
 
         points = np.array([task.work for task in tasks], np.float64)
         spent = np.array([seconds(lambda task=task: again(task)) for task in tasks])

@@ -1,7 +1,7 @@
-"""Labels of the simulated paths: Table I, what each knob moves, and the ceiling of any estimate.
+"""Labels of the simulated paths: Table I, what each knob moves, and what a second drive knows.
 
     python benchmarks/shinjuku_labels.py [--preset paper] [--out FOLDER] [--every 10] [--workers 1]
-    python benchmarks/shinjuku_labels.py --drives 0 1     # the ceiling: two drives of every path
+    python benchmarks/shinjuku_labels.py --drives 0 1     # two drives of every path
     python benchmarks/shinjuku_labels.py --against FOLDER # are they those of another run's folder?
     python benchmarks/shinjuku_labels.py --knobs drive    # one phenomenon switched off at a time
     python benchmarks/shinjuku_labels.py --knobs map --paths III

@@ -58,12 +58,7 @@ from tilestream.factors.observability import (
     whole_places,
 )
 from tilestream.factors.surfels import surfel_mm, surfels_in, tile_surfels
-from tilestream.factors.virtual_drive import (
-    ends_of,
-    physics_offset,
-    stratified_starts,
-    virtual_drive,
-)
+from tilestream.factors.virtual_drive import ends_of, stratified_starts, virtual_drive
 from tilestream.factors.virtual_scan import Beams, Scene, look, scan_in_world, virtual_scan
 from tilestream.formats.logs import open_log
 from tilestream.formats.points.pcd import write_pcd
@@ -317,7 +312,7 @@ def against(table: pd.DataFrame, estimates: dict[str, dict[str, str]]) -> pd.Dat
             fitted, median = np.empty(len(x)), np.empty(len(x))
             for path in both["path"].unique():
                 here = (both["path"] == path).to_numpy()
-                fitted[here] = x[here] + physics_offset(x[~here], y[~here])
+                fitted[here] = x[here] + np.median(y[~here] - x[~here])
                 median[here] = np.median(y[~here])
             skill = 1.0 - np.abs(fitted - y).mean() / np.abs(median - y).mean()
             figures = (f"{spearmanr(x, y)[0]:.2f}", f"{skill:.2f}")

@@ -1,14 +1,17 @@
 """Synthetic drives with the paper's error tails: factors and labels that vary smoothly."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from tilestream.model.dataset import Dataset
+from tilestream.factors.along_route import AVERAGED
+from tilestream.model.dataset import VIRTUAL_DRIVES, Dataset
 from tilestream.model.join import join
+from tilestream.model.physics import VIRTUAL
 from tilestream.records import Column
 
 Floats = NDArray[np.float64]
@@ -129,3 +132,37 @@ def caused() -> Dataset:
     shape = (values[:, 0] - values[:, -1] + values[:, 9]) / np.sqrt(3.0)
     labels = labels.assign(**labels_of(0.09 * np.exp(0.6 * shape)))
     return joined(factors, {"drive": labels})
+
+
+OBSERVED = (
+    *(Column(name, "OB", "m", name, "synthetic", "observability") for name in AVERAGED),
+    Column("ob_hint", "OB", "1", "What the virtual drive does not see.", "", "observability"),
+    Column("ob_noise", "OB", "1", "Nothing.", "", "observability"),
+)
+
+
+def with_virtual_drives(
+    found: Dataset, *, noise: float = 0.3, hidden: float = 0.0, seed: int = 0
+) -> Dataset:
+    """A dataset with virtual drives, 2 cm below the labels.
+
+    Args:
+        found: labelled places.
+        noise: of each place's own draw, in logarithms.
+        hidden: what a place's `ob_hint`, normal and as smooth as the other factors, adds to its
+            labels, in shares of them.
+        seed: of the random numbers.
+    """
+    rng = np.random.default_rng(seed)
+    rows = found.rows.reset_index(drop=True)
+    hint = smooth(rng, len(rows), 1, 6.0)[:, 0]
+    draw = np.exp(noise * rng.normal(size=len(rows)))
+    seen: dict[str, Floats] = {}
+    for target, column in VIRTUAL.items():
+        label = rows[target].to_numpy()
+        seen[column] = np.maximum(label - (target != "p_fail") * 0.02, 0.0) * draw
+        rows[target] = label * (1.0 + hidden * np.maximum(hint, -1.0))
+    seen["vd_tail"] = seen["vd_mean"] - seen["vd_floor"]
+    rows = rows.assign(**seen, ob_hint=hint, ob_noise=rng.normal(size=len(rows)))
+    along = rows.assign(route_id=rows["path"], status="done")[list(VIRTUAL_DRIVES)]
+    return replace(found, rows=rows, columns=(*found.columns, *OBSERVED), virtual_drives=along)

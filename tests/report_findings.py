@@ -84,6 +84,8 @@ def labels_of(places: pd.DataFrame, groups: tuple[str, ...], seed: int = 1) -> p
                     "arc_length": known["arc_length"].to_numpy(),
                     "error_mean": known["estimate"].to_numpy() * noise,
                     "held_out": known["estimate"].to_numpy() * 1.1,
+                    "low": (0.5 * known["estimate"]).where(known["route_id"] == "I").to_numpy(),
+                    "high": (2.0 * known["estimate"]).where(known["route_id"] == "I").to_numpy(),
                 }
             )
         )
@@ -101,6 +103,9 @@ def judged_by(models: list[str], protocols: tuple[str, ...]) -> pd.DataFrame:
                     "protocol": protocol, "model": model, "points": 400, "rmse": 1.5 * error,
                     "mae": error, "within_25mm": 0.6, "within_50mm": 0.9, "r2": 0.5, "skill": 0.4,
                     "spearman": 0.7 if k else float("nan"), "reason": "",
+                    "skill_low": 0.31, "skill_high": 0.52, "segment_skill": 0.6,
+                    "segment_spearman": 0.8, "segment_skill_low": 0.45,
+                    "segment_skill_high": 0.72,
                 }
             )  # fmt: skip
     rows.append({"protocol": protocols[-1], "reason": "one block only"})
@@ -142,6 +147,10 @@ AGAIN = {
     "r2": 0.9,
     "skill": 0.7,
     "spearman": float("nan"),
+    "drives": 2,
+    "limit": 0.79,
+    "limit_low": 0.74,
+    "limit_high": 0.83,
 }
 """What a repeated drive knows."""
 
@@ -183,21 +192,36 @@ def whole(seed: int = 0) -> Findings:
         ),
         coverage=pd.DataFrame(
             {
-                "path": ["I", "II"],
-                "points": [480, 220],
-                "level": [0.9, float("nan")],
-                "covered": [0.93, float("nan")],
-                "factor": [2.5, float("nan")],
+                "path": ["", "I", "II"],
+                "points": [480, 480, 220],
+                "blocks": [2, 2, 1],
+                "level": [0.9, 0.9, float("nan")],
+                "covered": [0.93, 0.93, float("nan")],
+                "error": [0.021, 0.021, float("nan")],
+                "width": [0.14, 0.14, float("nan")],
             }
         ),
         parts=pd.concat(
             [
-                judged_by(["default", "physics", "training median"], ("path", "blocks")).assign(
+                judged_by(["corrected", "physics", "training median"], ("path", "blocks")).assign(
                     target=target
                 )
                 for target in ("error_tail", "across_mean", "p_fail")
             ],
             ignore_index=True,
+        ),
+        differences=pd.DataFrame(
+            {
+                "protocol": ["paper", "path", "path"],
+                "points": 400,
+                "mae": [0.02, 0.004, -0.001],
+                "mae_low": [0.01, 0.001, -0.002],
+                "mae_high": [0.03, 0.006, 0.002],
+                "skill": [0.3, 0.05, -0.01],
+                "skill_low": [0.2, 0.02, -0.04],
+                "skill_high": [0.4, 0.09, 0.02],
+                "target": ["error_mean", "error_mean", "error_tail"],
+            }
         ),
         ceilings={"error_mean": AGAIN, "p_fail": AGAIN | {"mae": 0.021, "spearman": 0.81}},
         facts={

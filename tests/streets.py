@@ -52,6 +52,6 @@ def job(folder: Path, out: Path, **changes: object) -> RunSettings:
         "drives": [{"log": str(folder / f"{kind}.mcap")} for kind in STREETS],
         "observe": None,
         "label": {"matcher": "default", "starts": {"radius": 0.4, "step": 0.2}},
-        "model": {"recipe": "default"},
+        "model": {"recipe": "forest"},
     }
     return RunSettings(**(values | changes))

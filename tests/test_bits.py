@@ -23,9 +23,8 @@ from scenes import scene
 from threadpoolctl import threadpool_limits
 
 import tilestream as ts
+from tilestream.factors.along_route import AVERAGED, WIDTHS, averaged_along
 from tilestream.factors.local_similarity import covariances, curvatures, entropy
-from tilestream.factors.virtual_drive import COLUMNS as VIRTUAL
-from tilestream.factors.virtual_drive import averaged_along
 from tilestream.formats.logs.degrade import select
 from tilestream.formats.logs.deskew import Sweep, deskew
 from tilestream.formats.logs.poses import interpolate, matrices, transform
@@ -157,13 +156,14 @@ def test_the_virtual_drive_of_a_place_with_its_neighbours(
             "route_id": "r",
             "arc_length": step * np.arange(MOST),
             "status": rng.choice(["done", "failed"], MOST, p=[0.9, 0.1]),
-            **{column.name: rng.normal(size=MOST) for column in VIRTUAL},
+            **{name: rng.normal(size=MOST) for name in AVERAGED},
         }
     )
     reach = places["arc_length"].to_numpy()
-    near = np.abs(reach[:, None] - reach[some]).min(axis=1) <= 2.0 + 1e-3
-    part = averaged_along(places[near].sample(frac=1.0, random_state=seed))
-    expected = averaged_along(places).loc[some]
+    width = float(rng.choice(WIDTHS))
+    near = np.abs(reach[:, None] - reach[some]).min(axis=1) <= 2.0 * width + 1e-3
+    part = averaged_along(places[near].sample(frac=1.0, random_state=seed), width)
+    expected = averaged_along(places, width).loc[some]
     pd.testing.assert_frame_equal(part.loc[some], expected, check_exact=True)
 
 

@@ -9,7 +9,7 @@ import pytest
 from streets import job, street, write_drive
 
 import tilestream as ts
-from tilestream.factors.virtual_drive import AVERAGED, averaged_along
+from tilestream.factors.along_route import AVERAGED, WIDTH, averaged_along
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.pipeline.jobs.run_findings import labels_of
 from tilestream.pipeline.jobs.run_inputs import degraded_drives, inputs_of, observing_of
@@ -87,14 +87,14 @@ def test_its_labels_are_joined_with_that_and_the_estimate_is_of_the_vehicle(
     names = list(AVERAGED)
     for group in ("short", "whole"):
         mine = rows[rows["group"] == group].set_index("sample")
-        seen = averaged_along(own(run, group, "observability")).set_index("sample")
+        seen = own(run, group, "observability").set_index("sample")
         assert len(mine) == len(seen) > 5
         np.testing.assert_array_equal(mine[names], seen.loc[mine.index, names])
         assert set(mine["path"]) == {"canyon"}  # the route is the way of the same log
         np.testing.assert_allclose(mine["arc_length"], seen.loc[mine.index, "arc_length"], atol=0.1)
     places = pd.read_parquet(Path(run.out) / "report" / "places.parquet").set_index(KEYS)
     usual = tables(Path(run.out) / "tables" / "observability")
-    vehicle = averaged_along(usual).set_index(KEYS)["vd_mean"] + OFFSET
+    vehicle = averaged_along(usual, WIDTH).set_index(KEYS)["vd_mean"] + OFFSET
     np.testing.assert_array_equal(places["estimate"], vehicle[places.index])
     report = json.loads((Path(run.out) / "report" / "report.json").read_text())
     assert any("read as: short;" in note for note in report["notes"]["job"])

@@ -34,13 +34,14 @@ from tilestream.errors import (
     SourceNotFoundError,
     UsageError,
 )
+from tilestream.factors.along_route import averaged_along
 from tilestream.files import Files
 from tilestream.model import evaluation, forest, registry, training
 from tilestream.model.dataset import TARGETS
 from tilestream.model.file import load_model, save_model
 from tilestream.model.forest import Growth, PaperForest
 from tilestream.model.intervals import coverage
-from tilestream.model.training import PREDICTION_COLUMNS
+from tilestream.model.training import PREDICTION_COLUMNS, predict
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.cluster import dask_client
 from tilestream.pipeline.engine.costs import calibration_file, core_hours, learn
@@ -194,7 +195,7 @@ def test_the_page_says_what_makes_the_same_figures_again(done: tuple[Path, Told]
     assert facts["cores"] == os.cpu_count()
     assert facts["wall time, all calls [s]"] > 0.0
     model = facts["model"]
-    assert (model["from"], model["recipe"], model["trees"]) == ("trained here", "default", 4)
+    assert (model["from"], model["recipe"], model["trees"]) == ("trained here", "forest", 4)
     assert (model["seed"], model["points"]) == (0, len(STREETS) * SCANS)
     effective = yaml.safe_load((done[0] / "config.yaml").read_text())
     assert facts["settings"] | {"out": str(done[0]), "drives": effective["drives"]} == effective
@@ -207,7 +208,7 @@ def test_the_evaluation_has_every_protocol_and_opponent(done: tuple[Path, Told])
     found = json.loads((done[0] / "tables" / "evaluation.json").read_text())
     protocols = pd.DataFrame(found["protocols"])
     judged = protocols[protocols["reason"] == ""]
-    assert set(judged["model"]) == set(registry.COMPETITORS) - {registry.UNTRAINED}
+    assert set(judged["model"]) == set(registry.COMPETITORS) - set(registry.OF_VIRTUAL_DRIVES)
     assert {"paper", "path"} <= set(judged["protocol"])
     assert set(protocols["protocol"]) == {"paper", "path", "blocks"}
     blocks = protocols[protocols["protocol"] == "blocks"]
@@ -219,7 +220,7 @@ def test_the_evaluation_has_every_protocol_and_opponent(done: tuple[Path, Told])
     assert sets == {"FS", "FS+RQ", "FS+RQ+LY", "FS+RQ+LY+LS", "all + robust"}
     parts = pd.DataFrame(found["parts"])
     assert set(parts["target"]) == set(TARGETS) - {"error_mean"}
-    assert set(parts["model"]) == {"default", "training median"}
+    assert set(parts["model"]) == {"forest", "training median"}
     on_paths = parts[parts["protocol"] == "path"].set_index("target")
     assert on_paths.loc["error_tail", "reason"].str.contains("nothing to learn").all()
     assert (on_paths.drop("error_tail")["mae"] >= 0.0).all()  # all starts here are within 1 m
@@ -229,7 +230,7 @@ def test_the_evaluation_has_every_protocol_and_opponent(done: tuple[Path, Told])
 def test_held_out_estimates_stand_beside_the_labels(done: tuple[Path, Told]) -> None:
     report = json.loads((done[0] / "report" / "report.json").read_text())
     assert {path["path"] for path in report["paths"]} == set(STREETS)
-    held = pd.read_parquet(done[0] / "tables" / "judged" / "error_mean-default-all.parquet")
+    held = pd.read_parquet(done[0] / "tables" / "judged" / "error_mean-forest-all.parquet")
     part = held[held["protocol"] == "path"]
     assert len(part) == len(STREETS) * SCANS
     for fold, rows in part.groupby("fold"):
@@ -351,9 +352,9 @@ def the_recipe_in_use_is_evaluated(folder: Path, recipe: str) -> None:
     for path in report["paths"]:
         here = judged[judged["path"] == path["path"]]
         assert path["mae"] == pytest.approx((here["actual"] - here["estimate"]).abs().mean())
-    expected = coverage(judged).set_index("path")["factor"]
-    factors = {row["path"]: row["factor"] for row in report["coverage"]}
-    assert factors == pytest.approx(expected.to_dict())
+    expected = coverage(judged).set_index("path")["width"]
+    widths = {row["path"]: row["width"] for row in report["coverage"]}
+    assert widths == pytest.approx(expected.to_dict(), nan_ok=True)
     page = html.unescape((folder / "report" / "index.html").read_text())
     assert re.search(rf"The model of these estimates \([\d.]+.cm, {MODELS[recipe]}\)", page)
 
@@ -478,7 +479,8 @@ def test_the_thinning_of_a_map_that_is_there_counts(
 
 def test_observability_joins_the_factors(inputs: Path, copy: Path) -> None:
     told = Told()
-    ts.run(job(inputs, copy, observe={"range_max": 14.0}), watch=told)
+    model = {"recipe": "corrected"}
+    ts.run(job(inputs, copy, observe={"range_max": 14.0}, model=model), watch=told)
     assert {"surfels", "observe"} <= {outcome.stage for outcome in told.outcomes}
     assert told.worked() == set(LEARNT)
     dataset = ts.dataset(copy)
@@ -493,6 +495,19 @@ def test_observability_joins_the_factors(inputs: Path, copy: Path) -> None:
     assert own["used"] == list(load_model(copy / "model.skops").factors)
     assert own["paper"] == [c.name for c in dataset.columns if c.factor_set == "faithful"]
     assert "physics" in {row["model"] for row in found["protocols"]}
+    report = json.loads((copy / "report" / "report.json").read_text())
+    assert report["model"] == "corrected"
+    assert {row["model"] for row in report["parts"]} == {"corrected", "physics", "training median"}
+    compared = {(row["target"], row["protocol"]) for row in found["differences"]}
+    assert {("error_mean", "path"), ("across_mean", "path")} <= compared
+    used = load_model(copy / "model.skops")
+    assert report["facts"]["model"]["averaged along the route over [m]"] == used.width
+    seen = pd.concat(map(pd.read_parquet, (copy / "tables" / "observability").glob("*.parquet")))
+    seen = averaged_along(seen.reset_index(drop=True), used.width).set_index(["route_id", "sample"])
+    places = pd.read_parquet(copy / "report" / "places.parquet").set_index(["route_id", "sample"])
+    np.testing.assert_array_equal(places["vd_mean"], seen.loc[places.index, "vd_mean"])
+    again = predict(used, places)
+    pd.testing.assert_series_equal(again["estimate"], places["estimate"], check_exact=True)
 
 
 def test_nothing_is_learnt_or_estimated_without_the_virtual_drive_that_was_asked_for(
@@ -553,9 +568,27 @@ def test_physics_needs_no_drive(inputs: Path, tmp_path: Path) -> None:
     assert middle["tunnel"] > 1.5 * middle["canyon"]  # nothing holds a scan along a tunnel
 
 
-def test_physics_without_a_virtual_drive_is_refused(inputs: Path, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="needs observe"):
-        job(inputs, tmp_path / "run", model={"recipe": "physics"})
+def test_physics_of_a_short_drive_is_the_virtual_drive_as_it_is_and_says_so(
+    inputs: Path, tmp_path: Path
+) -> None:
+    """With 26 places nothing is fitted, and what was measured stands beside the estimates."""
+    drives = [{"log": str(inputs / "canyon.mcap")}]
+    seeing = {"range_max": 14.0, "starts": 8}
+    model = {"recipe": "physics"}
+    ts.run(job(inputs, tmp_path / "run", drives=drives, observe=seeing, model=model))
+    told = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert any("26 places are measured" in note for note in told["notes"]["job"])
+    places = pd.read_parquet(tmp_path / "run" / "report" / "places.parquet")
+    assert (places["estimate"] == places["vd_mean"]).all()
+    report = json.loads((tmp_path / "run" / "report" / "report.json").read_text())
+    assert report["paths"][0]["judged"] == 26
+    assert "train" not in told["stages"]
+
+
+def test_what_needs_a_virtual_drive_is_refused_without(inputs: Path, tmp_path: Path) -> None:
+    for recipe in ("physics", "corrected"):
+        with pytest.raises(UsageError, match=f"{recipe}, which needs observe.*paper, forest"):
+            job(inputs, tmp_path / "run", model={"recipe": recipe})
 
 
 # --- The settings

@@ -279,7 +279,8 @@ def test_each_path_is_that_of_the_drive_that_knows_most_of_it(
 ) -> None:
     factors, labels = short
     groups = {"one": labels.iloc[:400], "two": labels.iloc[150:]}
-    once = joined(factors, groups).each_path_once().rows
+    found = joined(factors, groups)
+    once = found.rows.iloc[found.rows_of_one_drive()]
     counts = once.groupby(["path", "group"]).size().to_dict()
     assert counts == {("a", "one"): 260, ("b", "two"): 410, ("c", "two"): 90}
 

@@ -1,31 +1,24 @@
 """Figures, protocols and intervals; that the random split proves nothing."""
 
-import math
 from dataclasses import asdict
 
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from model_data import COLUMNS, caused, dataset, drives, joined, unrelated
+from model_data import COLUMNS, caused, dataset, unrelated
 
 from tilestream.errors import ModelError
 from tilestream.model.evaluation import (
     PAPER_TABLE,
-    Figures,
-    ceiling,
     criterion_importances,
     cross_validate,
     factor_sets,
-    figures,
     figures_by_protocol,
-    figures_of,
     held_out,
     importances_of,
 )
+from tilestream.model.figures import Figures, figures, figures_of
 from tilestream.model.forest import Growth, PaperForest
-from tilestream.model.intervals import calibrate, coverage
 from tilestream.model.splits import block_splits, leave_path_out, random_split
 
 QUICK = Growth(trees=20)
@@ -106,18 +99,6 @@ def test_a_protocol_that_cannot_be_followed_says_why() -> None:
     assert table.loc[table["protocol"] != "paper", "mae"].isna().all()
 
 
-def test_the_ceiling_is_a_repeated_drive() -> None:
-    factors, labels = drives(1, {"a": 200})
-    again = labels.assign(error_mean=labels["error_mean"] + 0.01)
-    both = joined(factors, {"one": labels, "two": again}, COLUMNS)
-    found = ceiling(both)
-    assert found.points == 400
-    assert found.mae == pytest.approx(0.01)
-    assert found.skill > 0.5
-    with pytest.raises(ModelError, match="no place was driven twice"):
-        ceiling(both.groups(["one"]))
-
-
 def test_importances_find_the_causes() -> None:
     world, few = caused(), asdict(QUICK)
     fitted = PaperForest.fit(world, "error_mean", settings=few)
@@ -130,90 +111,3 @@ def test_importances_find_the_causes() -> None:
     assert by_criterion["factors"].sum() == len(COLUMNS)
     assert (by_criterion.loc[["FS", "RQ", "LS"], "increase"] > 0.005).all()
     assert abs(by_criterion.loc["LY", "increase"]) < 0.003
-
-
-def held_by_new_blocks(bias: float, blocks: int, seed: int) -> float:
-    """Mean share of the points of new blocks that lie in the interval calibrated on others.
-
-    Args:
-        bias: standard deviation between blocks, of the logarithm of the error.
-        blocks: how many calibrate.
-        seed: of the random numbers.
-    """
-    rng, held = np.random.default_rng(seed), []
-    names = np.repeat([f"b{k:02d}" for k in range(blocks)], 40)
-    for _ in range(150 + round(900 * bias)):  # the more, the more blocks differ
-        shift = bias * rng.normal(size=(blocks + 8, 1)) + 0.4 * rng.normal(size=(blocks + 8, 40))
-        actual, estimate = 0.1 * np.exp(shift), np.full((blocks + 8, 40), 0.1)
-        interval = calibrate(actual[:blocks].ravel(), estimate[:blocks].ravel(), names)
-        low, high = interval.around(estimate[blocks:])
-        held.append(((low <= actual[blocks:]) & (actual[blocks:] <= high)).mean())
-    assert interval.level == 0.9
-    assert interval.blocks == blocks
-    return float(np.mean(held))
-
-
-@pytest.mark.parametrize("bias", [0.0, 0.12, 0.5])
-@pytest.mark.parametrize("blocks", [3, 6, 12])
-def test_intervals_hold_what_they_promise_for_new_blocks(bias: float, blocks: int) -> None:
-    """With the unknown block at infinity they would hold 95 % and more.
-
-    The standard error is 0.005 where blocks differ most, and they hold 88 to 91 % there.
-    """
-    assert 0.86 < held_by_new_blocks(bias, blocks, seed=blocks) < 0.94
-
-
-@settings(max_examples=60, deadline=None)
-@given(
-    st.lists(st.lists(st.integers(0, 40), min_size=1, max_size=7), min_size=2, max_size=6),
-    st.sampled_from([0.5, 0.8, 0.9]),
-)
-def test_the_hardest_block_counts_twice(scores: list[list[int]], level: float) -> None:
-    """A literal reference: copies of points stand for weights."""
-    hardest = max(range(len(scores)), key=lambda k: (np.quantile(scores[k], level), -k))
-    same = math.lcm(*map(len, scores))  # every block gets as many points
-    pool = sorted(
-        score
-        for k, block in enumerate(scores)
-        for score in block
-        for _ in range(same // len(block) * (1 + (k == hardest)))
-    )
-    want = next(x for n, x in enumerate(pool, start=1) if n >= level * len(pool) - 1e-6)
-    actual = 0.1 * np.exp(0.1 * np.concatenate(scores))
-    names = np.repeat([f"b{k}" for k in range(len(scores))], [len(block) for block in scores])
-    mixed = np.random.default_rng(0).permutation(len(actual))
-    interval = calibrate(actual[mixed], np.full(len(actual), 0.1), names[mixed], level)
-    assert interval.factor == pytest.approx(np.exp(0.1 * want))
-    assert interval.level == level
-
-
-def test_intervals_by_hand_and_one_block_gives_none() -> None:
-    actual, estimate = np.array([0.1, 0.2, 0.4, 0.1]), np.full(4, 0.1)
-    block = np.array(["a", "a", "b", "b"])
-    # Block b is the harder: its points weigh 1/3 each, those of a 1/6; sorted 1/6 + 1/3 + 1/6.
-    assert calibrate(actual, estimate, block, 0.65).factor == pytest.approx(2.0)
-    interval = calibrate(actual, estimate, block)
-    assert interval.factor == pytest.approx(4.0)
-    assert interval.around(np.array([0.2])) == (pytest.approx(0.05), pytest.approx(0.8))
-    alone = calibrate(actual, estimate, np.array(["a"] * 4))
-    assert alone.blocks == 0
-    assert np.isnan([alone.level, alone.factor, *np.ravel(alone.around(estimate))]).all()
-
-
-def test_coverage_of_a_path_is_calibrated_elsewhere() -> None:
-    def points(error: float) -> pd.DataFrame:
-        path = np.repeat(["a", "b", "c"], 4)
-        return pd.DataFrame(
-            {
-                "path": path,
-                "block": [f"{p}#{k % 2}" for k, p in enumerate(path)],
-                "actual": np.where(path == "c", error, 0.12),
-                "estimate": 0.1,
-            }
-        )
-
-    assert coverage(points(0.11))["covered"].tolist() == [1.0, 1.0, 1.0]
-    found = coverage(points(0.5)).set_index("path")
-    assert found.loc["c", "covered"] == 0.0
-    assert found.loc["c", "factor"] == pytest.approx(1.2)
-    assert found.loc["a", "covered"] == 1.0

@@ -10,7 +10,7 @@ from scipy.stats import spearmanr
 
 from tilestream.model.explain import SHARES, UNITS, Typical, compared, in_words, typical_of
 from tilestream.model.features import features_of
-from tilestream.model.forest import DefaultForest, Growth
+from tilestream.model.forest import Growth, TunedForest
 from tilestream.model.phrases import PHRASES, REASSURING, phrase_of
 from tilestream.model.training import predict, train
 from tilestream.pipeline.stages.predict import physical
@@ -144,8 +144,8 @@ def test_the_worst_places_name_a_cause_in_the_map() -> None:
     learnt = joined(factors, {"drive": labels}, (*COLUMNS, *seen))
     with pytest.MonkeyPatch.context() as patch:
         growth = asdict(Growth(trees=10, leaf=8, log=True))
-        patch.setattr(DefaultForest, "tuned", lambda *_: growth)
-        model = train(learnt, recipe="default")
+        patch.setattr(TunedForest, "tuned", lambda *_: growth)
+        model = train(learnt, recipe="forest")
     typical = model.typical
     assert model.factors == ("vd_mean", "ob_info_along")
     found = predict(model, factors)

@@ -181,13 +181,13 @@ def altered(path: Path, facts: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("facts", "message"),
     [
-        ({"format_version": 0}, "of format 0, and this tilestream .* reads 2"),
+        ({"format_version": 0}, "of format 0, and this tilestream .* reads 3"),
         ({"sklearn": "0.24.2"}, f"scikit-learn 0.24.2, here is {sklearn.__version__}"),
         ({"format": "other"}, "no model of tilestream"),
         ({"factors": ["one"]}, "its forest is not of its factors"),
         (
             {"facts": {"recipe": "best"}},
-            "a model of 'best', and this tilestream has default, paper",
+            "a model of 'best', and this tilestream has corrected, forest, paper, physics",
         ),
         ({"interval": None}, "a damaged model file"),
         ({"typical": {"names": ["FDOP"], "units": ["1"]}}, "what is typical is not of its factors"),
@@ -307,17 +307,19 @@ def test_training_on_a_short_drive_says_that_nothing_was_calibrated(
 
 
 def test_bad_training_is_refused(learnt: Dataset) -> None:
-    with pytest.raises(UsageError, match="no recipe 'best': choose from default, paper"):
+    with pytest.raises(
+        UsageError, match="no recipe 'best': choose from corrected, forest, paper, physics"
+    ):
         train(learnt, recipe="best")
     with pytest.raises(ModelError, match="49 labelled points"):
         train(learnt.take(np.arange(49)))
 
 
-def test_the_default_model_is_tuned_and_calibrated() -> None:
+def test_our_forest_is_tuned_and_calibrated() -> None:
     factors, labels = drives(9, {"a": 210, "b": 210}, related=0.9)
     found = joined(factors, {"drive": labels}, COLUMNS[:4])
-    made = train(found, recipe="default")
+    made = train(found, recipe="forest")
     assert made.facts["log"]
     assert made.interval.blocks == 2
     assert made.interval.level == 0.9
-    assert made.interval.factor > 1.0
+    assert made.interval.above > 0.0

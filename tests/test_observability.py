@@ -7,8 +7,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scenes import PLACES
 
 import tilestream as ts
@@ -21,16 +19,13 @@ from tilestream.factors.observability import (
 )
 from tilestream.factors.surfels import in_view, surfels_in
 from tilestream.factors.virtual_drive import (
-    AVERAGED,
     AXES,
     MOMENT_COLUMNS,
+    PART_COLUMNS,
     RINGS,
     SPREAD_COLUMNS,
     Ends,
-    averaged_along,
     ends_of,
-    physics,
-    physics_offset,
     stratified_starts,
     virtual_drive,
     weighted_median,
@@ -208,7 +203,7 @@ def ends(seed: int, count: int = 32) -> Ends:
 def test_a_place_is_the_mean_of_its_draws_and_tells_their_spread() -> None:
     draws = [ends(k) for k in range(4)]
     found, alone = virtual_drive(draws), [virtual_drive([one]) for one in draws]
-    for name in AVERAGED:
+    for name in (column.name for column in PART_COLUMNS):
         each = np.array([one[name] for one in alone])
         assert found[name] == pytest.approx(each.mean())
         assert found[f"{name}_sd"] == pytest.approx(each.std(ddof=1))
@@ -239,73 +234,7 @@ def test_a_weighted_median_has_half_of_the_weight_on_each_side() -> None:
     assert math.isnan(weighted_median(values[:0], weight[:0]))
 
 
-def test_physics_is_the_virtual_drive_and_one_number() -> None:
-    mean = np.array([0.1, 0.2, np.nan, 0.5])
-    np.testing.assert_array_equal(physics(mean), mean)
-    offset = physics_offset(mean, np.array([0.14, 0.23, 0.3, 0.9]))
-    assert offset == pytest.approx(0.04)
-    np.testing.assert_allclose(physics(mean, offset), mean + offset)
-
-
 # --- The table
-
-
-def drives(arcs: list[float], failed: list[int], routes: int) -> pd.DataFrame:
-    """Sample points of some routes, shuffled, with virtual drives that have no pattern."""
-    rng = np.random.default_rng(len(arcs))
-    count = len(arcs)
-    values = {name: rng.normal(size=count) for name in (*AVERAGED, "vd_median")}
-    status = np.full(count, "done", dtype=object)
-    status[[k for k in failed if k < count]] = "failed"
-    table = pd.DataFrame(
-        {
-            "route_id": [f"r{k % routes}" for k in range(count)],
-            "arc_length": arcs,
-            "status": status,
-            **values,
-        }
-    )
-    table.loc[table["status"] == "failed", [*AVERAGED, "vd_median"]] = np.nan
-    return table.sample(frac=1.0, random_state=0).reset_index(drop=True)
-
-
-@given(
-    arcs=st.lists(st.integers(0, 60).map(lambda k: k / 4.0), min_size=1, max_size=30, unique=True),
-    failed=st.lists(st.integers(0, 29), max_size=6),
-    routes=st.integers(1, 3),
-)
-def test_neighbours_on_the_route_are_averaged(
-    arcs: list[float], failed: list[int], routes: int
-) -> None:
-    table = drives(arcs, failed, routes)
-    found = averaged_along(table)
-    for k, row in table.iterrows():
-        near = table[
-            (table["route_id"] == row["route_id"])
-            & ((table["arc_length"] - row["arc_length"]).abs() <= 2.0)
-            & (table["status"] == "done")
-        ]
-        for name in AVERAGED:
-            if row["status"] == "done":
-                assert found[name][k] == pytest.approx(near[name].mean(), abs=1e-12)
-            else:
-                assert math.isnan(found[name][k])
-    untouched = ["route_id", "arc_length", "status", "vd_median"]
-    pd.testing.assert_frame_equal(found[untouched], table[untouched])
-
-
-@given(cut=st.floats(0.0, 15.0), failed=st.lists(st.integers(0, 39), max_size=6))
-def test_company_does_not_show_in_an_average(cut: float, failed: list[int]) -> None:
-    table = drives([0.4 * k for k in range(40)], failed, 1)
-    whole = averaged_along(table)
-    part = table[table["arc_length"] <= cut + 2.0 + 1e-6]
-    mine = part.index[part["arc_length"] <= cut]
-    pd.testing.assert_frame_equal(averaged_along(part).loc[mine], whole.loc[mine], check_exact=True)
-
-
-def test_places_far_apart_stand_for_themselves() -> None:
-    table = drives([0.0, 3.0, 6.0, 8.5], [], 1)
-    pd.testing.assert_frame_equal(averaged_along(table), table)
 
 
 def test_every_column_is_there_and_documented(store: ts.TileStore) -> None:

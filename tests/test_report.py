@@ -107,7 +107,7 @@ def test_each_path_is_judged_by_what_was_held_out(found: Findings, folder: Path)
         here["held_out"].rank().corr(here["error_mean"].rank()), abs=1e-9
     )
     assert one["groups"] == ["morning", "noon"]
-    assert (one["factor"], two["factor"]) == (2.5, None)
+    assert (one["interval"], two["interval"]) == (True, False)
 
 
 def test_geoparquet_is_read_by_its_own_rules(found: Findings, folder: Path) -> None:
@@ -414,7 +414,7 @@ def test_bad_findings_are_refused(tmp_path: Path) -> None:
         Findings("t", places.iloc[:0])
     with pytest.raises(UsageError, match="route 'a' has sample 0 twice"):
         Findings("t", pd.concat([places, places.iloc[:1]]))
-    with pytest.raises(UsageError, match="labels: no column group, held_out"):
+    with pytest.raises(UsageError, match="labels: no column group, block, held_out"):
         Findings(
             "t", places, labels=pd.DataFrame({"path": ["a"], "arc_length": 0, "error_mean": 1})
         )

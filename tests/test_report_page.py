@@ -32,8 +32,7 @@ from tilestream.model.dataset import TARGETS
 from tilestream.model.registry import COMPETITORS
 from tilestream.model.splits import PROTOCOLS
 from tilestream.report import Findings, write_report
-from tilestream.report.charts import path_chart
-from tilestream.report.evaluation import MODELS, PAPER_IMPORTANCES, PARTS, PROTOCOL_NAMES
+from tilestream.report.evaluation import MODELS, PAPER_IMPORTANCES, PARTS, PROTOCOL_NAMES, worth
 from tilestream.report.formatting import cm, cm_by_name, cm_span, percent
 from tilestream.report.page import report_page
 from tilestream.report.segments import worst_places
@@ -93,7 +92,7 @@ def test_what_is_empty_says_why(others: dict[str, Path]) -> None:
         ("ends", "No picture: no place was labelled"),
         ("table-i", "the paper's own figures stand alone"),
         ("table-iii", "the paper's own paths stand alone"),
-        ("importances", "No forest was trained"),
+        ("importances", "Nothing was trained"),
         ("table-iv", "no labels, so nothing can be judged"),
         ("calibration", "No interval was checked"),
         ("protocols", "nothing can be judged"),
@@ -190,22 +189,13 @@ def test_the_path_charts_hold_measured_and_estimated(found: Findings, page: Path
     kept = np.isfinite(data["arc"])
     one = here[here["group"] == "noon"]
     np.testing.assert_allclose(data["estimate"][kept], 100.0 * one["held_out"])
-    np.testing.assert_allclose(data["low"][kept], 100.0 * one["held_out"] / 2.5)
-    np.testing.assert_allclose(data["high"][kept], 100.0 * one["held_out"] * 2.5)
+    np.testing.assert_allclose(data["low"][kept], 100.0 * one["low"])
+    np.testing.assert_allclose(data["high"][kept], 100.0 * one["high"])
     assert not np.isfinite(source(charts(page)["path-1"], "estimate")["high"]).any()
 
 
-def test_an_interval_of_the_models_own_goes_before_that_of_the_paths(found: Findings) -> None:
-    held = found.labels["held_out"]
-    labels = found.labels.assign(low=0.9 * held, high=1.2 * held)
-    data = source(path_chart(replace(found, labels=labels), "II", "here"), "estimate")
-    kept = np.isfinite(data["arc"])
-    np.testing.assert_allclose(data["low"][kept], 0.9 * data["estimate"][kept])
-    np.testing.assert_allclose(data["high"][kept], 1.2 * data["estimate"][kept])
-
-
 def test_table_iv_names_the_model_where_there_are_several(found: Findings) -> None:
-    two = pd.concat([found.table_iv, found.table_iv.assign(model="default")])
+    two = pd.concat([found.table_iv, found.table_iv.assign(model="forest")])
     text = text_of(replace(found, table_iv=two), "table-iv")
     assert "FS+RQ, forest, the paper's setting 1.00" in text
     assert "FS+RQ, forest, tuned on held-out blocks 1.00" in text
@@ -226,7 +216,7 @@ def test_table_iv_stands_beside_the_papers_and_names_the_leak(page: Path) -> Non
     paper = text.index("the paper, random split leaks")
     for figures in ("FS 3.39 cm 5.75 cm 59.4 % 81.8 %", "LS 2.83 cm 4.83 cm 64.1 % 85.7 %"):
         assert text.index(figures) > paper
-    assert "random split leaks FS 1.00 cm 1.50 cm 60.0 % 90.0 % 0.50 0.40" in text
+    assert "random split leaks FS 1.00 cm 1.50 cm 60.0 % 90.0 % 0.50 0.40 0.31 to 0.52" in text
     assert "leave one path out FS 2.00 cm" in text
     assert "not followed: one block only" in text
 
@@ -235,14 +225,15 @@ def test_the_protocols_say_who_wins(page: Path, tmp_path: Path) -> None:
     text = text_of(page, "protocols")
     assert "so these figures prove nothing. model" in text  # no verdict where it leaks
     verdict = (
-        "The model of these estimates (2.40 cm, forest, tuned on held-out blocks) beats the best "
-        "opponent (2.80 cm, the training median everywhere) by mean absolute error, over 400 "
+        f"The model of these estimates (3.20 cm, {MODELS['corrected']}) beats the best "
+        "opponent (3.60 cm, the training median everywhere) by mean absolute error, over 400 "
         "points. Better here than the model in use: forest, the paper's setting (2.00 cm; "
         "model.recipe: paper )"
     )
     assert verdict in text
     assert "Not followed in this run: one block only." in text
     assert "a second drive over the same places 1.10 cm 2.00 cm 90.0 % 97.0 % 0.90 0.70 –" in text
+    assert "all drives there could be – – – – – 0.79 0.74 to 0.83 – – –" in text
     losing = whole().protocols
     losing.loc[losing["model"] == "nearest training point", "mae"] = 0.001
     from_losers = replace(whole(), protocols=losing, around=None, model="paper")
@@ -254,17 +245,29 @@ def test_the_protocols_say_who_wins(page: Path, tmp_path: Path) -> None:
     assert "beat" not in elsewhere.replace("must beat", "").replace("it beats the opponents", "")
 
 
+def test_the_model_in_use_is_compared_with_physics(page: Path) -> None:
+    text = text_of(page, "protocols")
+    assert "the mean error, leave one path out 0.40 cm 0.05 0.02 to 0.09 better" in text
+    tail = "tail: what starts farther than 1 m add, leave one path out -0.10 cm -0.01 -0.04 to 0.02"
+    assert f"{tail} no difference that is sure" in text
+    assert "the mean error, random split" not in text  # where it leaks nothing is compared
+    row = {"skill_low": -0.3, "skill_high": -0.1}
+    assert worth(row) == "worse"
+    assert worth({"skill_low": None, "skill_high": None}) == "not known: one block"
+
+
 def test_the_parts_of_the_error_are_judged_beside_a_repeated_drive(page: Path) -> None:
     text = text_of(page, "protocols")
     parts = text[text.index("the parts of the error, on paths left out") :]
     again = "a second drive over the same places"
     assert (
-        "tail: what starts farther than 1 m add forest, tuned on held-out blocks 1.00 cm 0.40 – "
-        "the virtual drive in the map, without a forest 1.40 cm 0.40 0.70"
+        f"tail: what starts farther than 1 m add {MODELS['corrected']} 1.00 cm 0.40 0.31 to 0.52 "
+        f"– 0.60 0.45 to 0.72 0.80 {MODELS['physics']} 1.40 cm 0.40 0.31 to 0.52 0.70 0.60"
     ) in parts
     assert "across the road" in parts
-    assert "share of the starts that fail forest, tuned on held-out blocks 1.00 % 0.40" in parts
-    assert parts.endswith(f"{again} 2.10 % 0.70 0.81")
+    assert f"share of the starts that fail {MODELS['corrected']} 1.00 % 0.40" in parts
+    assert f"{again} 2.10 % 0.70 0.81 – –" in parts
+    assert parts.endswith("the mean of all drives there could be – 0.79 0.74 to 0.83 – – –")
     assert parts.count(again) == 1  # the ceiling of the others is not known
     alone = text_of(replace(whole(), parts=pd.DataFrame()), "protocols")
     assert "Not judged in this run." in alone
@@ -323,8 +326,9 @@ def test_importances_name_their_forest(page: Path) -> None:
 
 def test_intervals_are_told_against_their_promise(page: Path) -> None:
     text = text_of(page, "calibration")
-    assert "Promised 90 %, held 93.0 % on average, 93.0 % to 93.0 % by path." in text
-    assert "I 480 90.0 % 93.0 % f = 2.50" in text
+    assert "Promised 90 %, held 93.0 % ± 2.1 % on average (standard error by 2 blocks" in text
+    assert "93.0 % to 93.0 % by path." in text
+    assert "I 480 90.0 % 93.0 % ± 2.1 % 14.0 cm" in text
     assert "II 220 none none – not calibrated" in text
 
 

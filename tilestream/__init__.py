@@ -2,7 +2,7 @@
 
 ```
 files -> points -> tile store -> cells -> factors per sample point --+
-scans -> 317 registrations each -------> error per sample point -----+-> forest -> error everywhere
+scans -> 317 registrations each -------> error per sample point -----+-> model -> error everywhere
 ```
 
 The same bits for any split: on one machine and installation every table up to the report's,

@@ -24,9 +24,6 @@ RINGS = {"near": (0.0, 0.5, 1 / 4), "middle": (0.5, 0.75, 1 / 4), "far": (0.75, 
 starts of a draw. The near one, within 1.0 m, makes the floor; far starts decide the tail."""
 AXES = ("along", "across", "up", "roll", "pitch", "yaw_vector")
 """The six signed errors of a start (`start_errors`)."""
-NEIGHBOURS = 2.0
-"""Virtual drives within this distance along the route are averaged [m]: the radius of the disc of
-starts."""
 GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 """Turn from one start to the next, so that any number of them is spread evenly [rad]; half of it
 from the starts of one draw to those of the next."""
@@ -91,11 +88,6 @@ COLUMNS = (
     *SPREAD_COLUMNS,
     *MOMENT_COLUMNS,
 )
-
-AVERAGED = tuple(column.name for column in PART_COLUMNS)
-"""Columns that are averaged along the route."""
-SLACK = 1e-6
-"""Arc lengths are sums: neighbours at the full distance may lie this much beyond it [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,7 +173,7 @@ def ends_of(
 def virtual_drive(drives: Sequence[Ends]) -> dict[str, float]:
     """What draws say together, in the columns of `COLUMNS`; at least one."""
     said = pd.DataFrame([_parts(one) for one in drives])
-    spread = said[list(AVERAGED)].std(ddof=1)
+    spread = said[[column.name for column in PART_COLUMNS]].std(ddof=1)
     return {
         **{str(name): float(value) for name, value in said.mean().items()},
         "vd_draws": float(len(drives)),
@@ -231,52 +223,3 @@ def weighted_median(values: Float64, weight: Float64) -> float:
     order = np.argsort(values, kind="stable")
     up_to = np.cumsum(weight[order])
     return float(values[order][np.searchsorted(up_to, 0.5 * up_to[-1])])
-
-
-def physics(vd_mean: Float64, offset: float = 0.0) -> Float64:
-    """The error as the virtual drive alone estimates it, without training [m].
-
-    A virtual scan is better than a real one: nothing moves, and nothing has changed since the
-    survey. The error that a real scan adds is one number, measured once or fitted on any drive.
-
-    Args:
-        vd_mean: (k,) [m].
-        offset: error that every real scan adds [m], e.g. `physics_offset` of another drive.
-    """
-    return np.asarray(vd_mean, np.float64) + offset
-
-
-def physics_offset(vd_mean: Float64, error_mean: Float64) -> float:
-    """The offset of `physics` that fits measured errors best: the median of the differences [m]."""
-    difference = np.asarray(error_mean, np.float64) - np.asarray(vd_mean, np.float64)
-    return float(np.median(difference[np.isfinite(difference)]))
-
-
-def averaged_along(places: pd.DataFrame) -> pd.DataFrame:
-    """The virtual drives of sample points, averaged with those of their neighbours on the route.
-
-    Where a registration ends is random to a degree, and places 1 m apart see nearly the same: their
-    drives are repeated samples of one value. Sample points farther apart than `NEIGHBOURS` keep
-    their own.
-
-    Args:
-        places: a row per sample point: `route_id`, `arc_length` [m], `status`, `COLUMNS`; an index
-            without repeats. The average of a point is right if all points within `NEIGHBOURS`
-            of it are there.
-
-    Returns:
-        The table, rows in the same order, `AVERAGED` of the points that are done as means over the
-        points that are done from `arc_length - NEIGHBOURS` to `arc_length + NEIGHBOURS`: the same
-        to the bit in any company.
-    """
-    averaged = places.copy()
-    done = places[places["status"] == "done"].sort_values("arc_length", kind="stable")
-    for _, route in done.groupby("route_id", sort=False):
-        arc = route["arc_length"].to_numpy(np.float64)
-        first = np.searchsorted(arc, arc - NEIGHBOURS - SLACK)
-        behind = np.searchsorted(arc, arc + NEIGHBOURS + SLACK)
-        # Each window is summed for itself, in its order; the row of zeros ends the last one.
-        values = np.vstack([route[list(AVERAGED)].to_numpy(np.float64), np.zeros(len(AVERAGED))])
-        sums = np.add.reduceat(values, np.column_stack([first, behind]).ravel(), axis=0)[::2]
-        averaged.loc[route.index, list(AVERAGED)] = sums / (behind - first)[:, None]
-    return averaged

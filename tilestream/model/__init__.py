@@ -2,8 +2,9 @@
 
 ```
 factors --+            splits (what is held out) --> evaluation (Table IV, opponents)
-          +--> join --> dataset --+--> registry: forest, physics, baselines (each a regressor)
+          +--> join --> dataset --+--> registry: physics, corrected, forest, baselines
 errors  --+                       +--> intervals, domain, explain --> training --> file
+                                  +--> figures, bootstrap, repeats: how good, and how sure that is
 ```
 
 A regressor is one file, which says all about itself, and a line of `registry.py`. Only this folder

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from tilestream.errors import ModelError, UsageError
+from tilestream.factors.along_route import AVERAGED, averaged_along
 from tilestream.records import Column, Float64, Int64
 from tilestream.sensor import Sensor
 
@@ -27,6 +28,8 @@ LEAST = 1e-4
 """Errors below this count as this, before a logarithm [m]."""
 POINTS_MIN = 50
 """Fewest labelled points that a model is trained on."""
+VIRTUAL_DRIVES = ("group", "route_id", "sample", "arc_length", "status", *AVERAGED)
+"""What is kept of the virtual drives of all places of the drives."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +42,8 @@ class Dataset:
     """
 
     rows: pd.DataFrame
-    """The points that have factors and labels, none of them NaN."""
+    """The points that have factors and labels, none of them NaN; their virtual drives each of its
+    own place alone (`averaged`)."""
     columns: tuple[Column, ...]
     """The factors that are features of a model; never a position, a heading or a name."""
     lost: pd.DataFrame
@@ -48,6 +52,10 @@ class Dataset:
     """What the factors were computed with; see `made_with`."""
     data_sets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """The identity of each group's labels: matcher, starts, true pose, cell size, sensor."""
+    virtual_drives: pd.DataFrame = field(
+        default_factory=lambda: pd.DataFrame(columns=list(VIRTUAL_DRIVES))
+    )
+    """The virtual drives of all places of the drives, labelled or not, along each drive."""
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -82,17 +90,32 @@ class Dataset:
         """These rows only."""
         return replace(self, rows=self.rows.iloc[which].reset_index(drop=True))
 
-    def each_path_once(self) -> "Dataset":
-        """Each path as the drive has it with the most labels there (equal: the first by name): for
-        evaluations.
+    def averaged(self, width: float) -> "Dataset":
+        """With virtual drives averaged along each drive (`averaged_along`); a dataset without them
+        as it is.
 
-        With a repeated drive a random split would put the same place on both sides.
+        Args:
+            width: of the kernel [m].
+        """
+        seen = self.virtual_drives
+        if seen.empty:
+            return self
+        keys, names = ["group", "sample"], list(AVERAGED)
+        drives = [averaged_along(drive, width) for _, drive in seen.groupby("group")]
+        found = pd.concat(drives).set_index(keys)[names]
+        here = found.reindex(pd.MultiIndex.from_frame(self.rows[keys]))
+        columns = {name: here[name].to_numpy(np.float64) for name in names}
+        return replace(self, rows=self.rows.assign(**columns))
+
+    def rows_of_one_drive(self) -> Int64:
+        """(k,) rows of each path as the drive has it with the most labels there (equal: the first
+        by name): with a repeated drive a random split would put a place on both sides.
         """
         counts = self.rows.groupby(["path", "group"], as_index=False).size()
         order = counts.sort_values(["path", "size", "group"], ascending=[True, False, True])
         most = order.drop_duplicates("path").set_index("path")["group"]
         chosen = self.rows["path"].map(most) == self.rows["group"]
-        return self.take(np.flatnonzero(chosen.to_numpy()))
+        return np.flatnonzero(chosen.to_numpy())
 
     def groups(self, names: Sequence[str]) -> "Dataset":
         """The rows of these groups only.

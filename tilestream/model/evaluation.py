@@ -1,24 +1,22 @@
 """How good estimates are: Table IV and what stands beside it, on every protocol."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import spearmanr
 
 from tilestream.errors import ModelError
-from tilestream.model.dataset import Dataset, nearest_along
+from tilestream.model.dataset import Dataset
+from tilestream.model.figures import FIGURES, difference, with_spans
+from tilestream.model.physics import width_of
 from tilestream.model.registry import COMPETITORS
 from tilestream.model.regressor import Regressor
 from tilestream.model.splits import PROTOCOLS, Split, block_splits
-from tilestream.records import Column, Float64
+from tilestream.records import Column
 
 CRITERIA = ("FS", "RQ", "LY", "LS")
 """The paper's four criteria, in the order in which Table IV adds them."""
-SAME_PLACE = 0.5
-"""How far apart along a path the labels of two drives are of one place [m]."""
 REPEATS = 5
 """Permutations of a criterion."""
 PAPER_TABLE = pd.DataFrame(
@@ -31,58 +29,6 @@ PAPER_TABLE = pd.DataFrame(
     }
 )
 """The paper's own Table IV [m, shares], its random split."""
-
-
-@dataclass(frozen=True)
-class Figures:
-    """How far estimates are from what was measured."""
-
-    points: int
-    """How many points."""
-    rmse: float
-    """Root mean square error [unit of the target; m for lengths]."""
-    mae: float
-    """Mean absolute error [the same]."""
-    within_25mm: float
-    """Share of the points estimated with an error below 2.5 cm."""
-    within_50mm: float
-    """Share of the points estimated with an error below 5 cm."""
-    r2: float
-    """1 - squared error / squared deviation from the mean of the labels; NaN if they are all
-    alike."""
-    skill: float
-    """1 - MAE / MAE of the training median; NaN if that is 0."""
-    spearman: float
-    """Rank correlation of estimate and label; NaN where one of them is constant."""
-
-
-def figures(actual: Float64, estimate: Float64, median: Float64) -> Figures:
-    """The figures of estimates.
-
-    Args:
-        actual: (n,) labels.
-        estimate: (n,) estimates of them.
-        median: (n,) the training median at each point, for the skill.
-
-    Raises:
-        ModelError: no points.
-    """
-    if not len(actual):
-        raise ModelError("no points to evaluate")
-    error = np.abs(estimate - actual)
-    spread = float(((actual - actual.mean()) ** 2).sum())
-    of_median = float(np.abs(median - actual).mean())
-    vary, both_vary = np.ptp(actual) > 0.0, np.ptp(actual) > 0.0 and np.ptp(estimate) > 0.0
-    return Figures(
-        points=len(actual),
-        rmse=float(np.sqrt((error**2).mean())),
-        mae=float(error.mean()),
-        within_25mm=float((error < 0.025).mean()),
-        within_50mm=float((error < 0.05).mean()),
-        r2=1.0 - float((error**2).sum()) / spread if vary else float("nan"),
-        skill=1.0 - float(error.mean()) / of_median if of_median > 0.0 else float("nan"),
-        spearman=float(spearmanr(actual, estimate).statistic) if both_vary else float("nan"),
-    )
 
 
 def held_out(
@@ -100,7 +46,9 @@ def held_out(
     """
     parts = []
     for split in splits:
-        train, test = dataset.take(split.train), dataset.take(split.test)
+        # The width too is chosen on what trains.
+        averaged = dataset.averaged(width_of(dataset.take(split.train)))
+        train, test = averaged.take(split.train), averaged.take(split.test)
         part = test.rows[["group", "path", "block", "arc_length"]].assign(
             row=split.test,
             fold=split.name,
@@ -110,12 +58,6 @@ def held_out(
         )
         parts.append(part)
     return pd.concat(parts, ignore_index=True)
-
-
-def figures_of(points: pd.DataFrame) -> Figures:
-    """The figures of `held_out` points."""
-    names = ("actual", "estimate", "median")
-    return figures(*(points[name].to_numpy(np.float64) for name in names))
 
 
 def factor_sets(columns: Sequence[Column]) -> dict[str, tuple[Column, ...]]:
@@ -160,7 +102,7 @@ def figures_by_protocol(found: Mapping[str, pd.DataFrame | str], model: str) -> 
     """What `cross_validate` found as figures.
 
     Returns:
-        A row per protocol: `protocol`, `model`, the fields of `Figures`, `reason` (why a protocol
+        A row per protocol: `protocol`, `model`, the columns of `FIGURES`, `reason` (why a protocol
         cannot be followed on this dataset; its figures are then NaN).
     """
     rows: list[dict[str, object]] = []
@@ -169,32 +111,28 @@ def figures_by_protocol(found: Mapping[str, pd.DataFrame | str], model: str) -> 
         if isinstance(points, str):
             rows.append(row | {"reason": points})
         else:
-            rows.append(row | asdict(figures_of(points)) | {"reason": ""})
-    names = ["protocol", "model", *(f.name for f in fields(Figures)), "reason"]
-    return pd.DataFrame(rows).reindex(columns=names)
+            rows.append(row | with_spans(points) | {"reason": ""})
+    return pd.DataFrame(rows).reindex(columns=["protocol", "model", *FIGURES, "reason"])
 
 
-def ceiling(dataset: Dataset, target: str = "error_mean") -> Figures:
-    """What no model can pass: a repeated drive's label as the estimate of this drive's.
+def differences_by_protocol(
+    found: Mapping[str, pd.DataFrame | str], others: Mapping[str, pd.DataFrame | str]
+) -> pd.DataFrame:
+    """How much better one competitor is than another on the same held-out points.
 
-    Every label is paired with the nearest of each other drive, at most 0.5 m away along the path.
-    The median is that of all labels.
+    Args:
+        found: what `cross_validate` found of it.
+        others: and of the other.
 
-    Raises:
-        ModelError: no place was driven twice.
+    Returns:
+        A row per protocol that both could follow: `protocol`, and the fields of `difference`.
     """
-    here = dataset.rows[["path", "arc_length", "group", target]]
-    parts = [
-        nearest_along(
-            here[here["group"] != name], drive.rename(columns={target: "again"}), SAME_PLACE
-        )
-        for name, drive in here.groupby("group")
-    ]
-    pairs = pd.concat(parts or [here.assign(again=np.nan)]).dropna(subset="again")
-    if pairs.empty:
-        raise ModelError("no place was driven twice: the ceiling needs a repeated drive")
-    median = np.full(len(pairs), np.median(dataset.label(target)))
-    return figures(pairs[target].to_numpy(), pairs["again"].to_numpy(), median)
+    rows = []
+    for protocol, points in found.items():
+        against = others.get(protocol, "")
+        if not isinstance(points, str) and not isinstance(against, str):
+            rows.append({"protocol": protocol, **difference(points, against)})
+    return pd.DataFrame(rows)
 
 
 def importances_of(regressor: Regressor, columns: Sequence[Column]) -> pd.DataFrame:

@@ -60,3 +60,8 @@ def with_derived(factors: pd.DataFrame) -> pd.DataFrame:
         turned["score_var_along"] = c * c * xx + 2.0 * c * s * xy + s * s * yy
         turned["score_var_across"] = s * s * xx - 2.0 * c * s * xy + c * c * yy
     return factors.assign(**turned)
+
+
+def observed(columns: Sequence[Column]) -> list[Column]:
+    """The factors that look from a place: observability and the virtual drive."""
+    return [column for column in columns if column.factor_set == "observability"]

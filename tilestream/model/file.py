@@ -19,6 +19,7 @@ import skops
 import skops.io
 
 from tilestream.errors import ModelError, SourceNotFoundError, foreign_errors
+from tilestream.factors.along_route import WIDTHS
 from tilestream.files import Files
 from tilestream.model.domain import Domain
 from tilestream.model.explain import Typical
@@ -28,7 +29,7 @@ from tilestream.model.training import Model
 from tilestream.version import VERSION
 
 FORMAT = "tilestream model"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 """Raise it when a model of an older file would be read wrongly."""
 CONTAINERS = frozenset(
     {
@@ -76,6 +77,7 @@ def save_model(model: Model, path: str | os.PathLike[str]) -> None:
         "interval": {k: None if v != v else v for k, v in asdict(model.interval).items()},
         "threshold": model.domain.threshold,
         "typical": {name: getattr(model.typical, name) for name in ("names", "units", "clear")},
+        "width": model.width,
         "worst": model.worst,
         "facts": dict(model.facts),
     }
@@ -207,19 +209,21 @@ def _model(content: Mapping[str, Any], facts: Mapping[str, Any]) -> Model:
     known, units = (tuple(str(text) for text in facts["typical"][k]) for k in ("names", "units"))
     if {len(units), *(a.size for a in typical.values())} != {len(known)} or set(names) - set(known):
         raise ModelError("a damaged model file: what is typical is not of its factors")
-    level, factor, blocks = (facts["interval"][k] for k in ("level", "factor", "blocks"))
+    if facts["width"] not in WIDTHS:
+        raise ModelError(f"a damaged model file: no width of averages is {facts['width']!r}")
+    level, constant, below, above = (
+        float("nan") if facts["interval"][k] is None else float(facts["interval"][k])
+        for k in ("level", "constant", "below", "above")
+    )
     return Model(
         regressors=regressors,
         domain=Domain(**arrays, threshold=float(facts["threshold"])),
         typical=Typical(known, units, **typical, clear=float(facts["typical"]["clear"])),
-        interval=Interval(
-            float("nan") if level is None else float(level),
-            float("nan") if factor is None else float(factor),
-            int(blocks),
-        ),
+        interval=Interval(level, constant, below, above, int(facts["interval"]["blocks"])),
         factors=names,
         made_with=facts["made_with"],
         data_set=facts["data_set"],
+        width=float(facts["width"]),
         worst=float(facts["worst"]),
         facts=facts["facts"],
     )

@@ -11,8 +11,16 @@ from sklearn.ensemble import RandomForestRegressor
 
 from tilestream.errors import ModelError
 from tilestream.model.dataset import LEAST, LENGTHS, Dataset, matrix
+from tilestream.model.features import observed
 from tilestream.model.regressor import Kind, Regressor, held_out_estimates
 from tilestream.model.splits import block_splits
+from tilestream.model.trees import (
+    TREE_TYPES,
+    Float32,
+    added_by_factors,
+    leads_somewhere,
+    sum_of,
+)
 from tilestream.records import Column, Float64
 
 
@@ -43,18 +51,10 @@ class Forest(Regressor):
 
     For the few places of a tile `predict` of scikit-learn's forest takes three times as long as
     those of its trees, so these are called one after the other and summed in the same order.
-    Contributions and the check of a file read the arrays of each `tree_`, as scikit-learn's guide
-    to the structure of trees does: no method gives the values of inner nodes.
     """
 
     kind: ClassVar[Kind] = "ours"
-    types = frozenset(
-        {
-            "sklearn.ensemble._forest.RandomForestRegressor",
-            "sklearn.tree._classes.DecisionTreeRegressor",
-            "sklearn.tree._tree.Tree",
-        }
-    )
+    types = TREE_TYPES | {"sklearn.ensemble._forest.RandomForestRegressor"}
 
     factors: tuple[str, ...]
     settings: Mapping[str, Any]
@@ -92,35 +92,17 @@ class Forest(Regressor):
 
     def predict(self, places: pd.DataFrame) -> Float64:
         """(n,) estimates."""
-        X32 = self._inputs(places)
-        raw = np.zeros(len(X32))
-        for tree in self.trees.estimators_:
-            raw += tree.predict(X32, check_input=False)
-        raw /= len(self.trees.estimators_)
+        trees = self.trees.estimators_
+        raw = sum_of(trees, self._inputs(places)) / len(trees)
         estimates: Float64 = np.exp(raw) if self.log else raw
         return estimates
 
     def contributions(self, places: pd.DataFrame) -> Float64:
-        """(n, f) what each factor adds along the paths through the trees.
-
-        On the way from root to leaf, a step changes the mean of the labels at hand; the change
-        belongs to the factor that the node compares (Saabas 2014). The sum over the factors, plus
-        the mean over the roots, is the estimate in the trees' own unit.
+        """(n, f) what each factor adds along the paths through the trees: its sum over the factors,
+        plus the mean over the roots, is the estimate in the trees' own unit.
         """
-        X32 = self._inputs(places)
-        total = np.zeros(X32.shape)
-        for estimator in self.trees.estimators_:
-            tree = estimator.tree_
-            value = tree.value[:, 0, 0]
-            inner = np.flatnonzero(tree.children_left >= 0)
-            change, factor = np.zeros(tree.node_count), np.zeros(tree.node_count, np.int64)
-            for child in (tree.children_left[inner], tree.children_right[inner]):
-                change[child], factor[child] = value[child] - value[inner], tree.feature[inner]
-            paths = estimator.decision_path(X32, check_input=False)
-            row = np.repeat(np.arange(len(X32)), np.diff(paths.indptr))
-            place = row * X32.shape[1] + factor[paths.indices]
-            total += np.bincount(place, change[paths.indices], X32.size).reshape(X32.shape)
-        return total / len(self.trees.estimators_)
+        added: Float64 = added_by_factors(self.trees.estimators_, self._inputs(places))
+        return added / len(self.trees.estimators_)
 
     def importances(self) -> Float64:
         """(f,) decrease of impurity: biased, since the counts are all correlated."""
@@ -138,37 +120,21 @@ class Forest(Regressor):
         """As `Regressor.load`: scikit-learn walks trees without checking, so each is checked."""
         if not isinstance(saved, RandomForestRegressor) or saved.n_features_in_ != len(factors):
             raise ModelError("a damaged model file: its forest is not of its factors")
-        if not all(_ends(estimator.tree_, len(factors)) for estimator in saved.estimators_):
+        if not all(
+            leads_somewhere(estimator.tree_, len(factors)) for estimator in saved.estimators_
+        ):
             raise ModelError("a damaged model file: a tree leads nowhere")
         own = {part.name: settings[part.name] for part in fields(Growth)}
         log = _of_logarithms(bool(own["log"]), target)
         return cls(factors, own, saved.set_params(n_jobs=1), log)
 
-    def _inputs(self, places: pd.DataFrame) -> np.ndarray[Any, np.dtype[np.float32]]:
+    def _inputs(self, places: pd.DataFrame) -> Float32:
         return np.ascontiguousarray(matrix(places, self.factors), np.float32)
 
 
 def _of_logarithms(log: bool, target: str) -> bool:
     """Whether the trees for a target learn logarithms: shares may be 0."""
     return log and target in LENGTHS
-
-
-def _ends(tree: Any, factors: int) -> bool:
-    """Whether every path through a tree ends, and compares only factors that exist."""
-    nodes = np.arange(tree.node_count)
-    left, right = tree.children_left, tree.children_right
-    inner = left >= 0
-    return (
-        tree.node_count > 0
-        and tree.n_features == factors
-        and tree.value.shape == (tree.node_count, 1, 1)
-        and bool(((left < 0) == (right < 0)).all())
-        # Children come after their parent, so every walk ends.
-        and bool((np.minimum(left, right) > nodes)[inner].all())
-        and bool((np.maximum(left, right) < tree.node_count)[inner].all())
-        and bool(((tree.feature >= 0) & (tree.feature < factors))[inner].all())
-        and bool(np.isfinite(tree.value).all())
-    )
 
 
 class PaperForest(Forest):
@@ -179,10 +145,10 @@ class PaperForest(Forest):
     defaults = asdict(Growth())
 
 
-class DefaultForest(Forest):
+class TunedForest(Forest):
     """Ours."""
 
-    name = "default"
+    name = "forest"
     words = "forest, tuned on held-out blocks"
     defaults = asdict(CAUTIOUS)
 
@@ -191,7 +157,7 @@ class DefaultForest(Forest):
         """Observability alone where the dataset has it, else all: the others mostly identify a
         street, which is of no use on a street never driven (benchmarks/RESULTS.md).
         """
-        return [c for c in columns if c.factor_set == "observability"] or columns
+        return observed(columns) or columns
 
     @classmethod
     def tuned(

@@ -118,9 +118,13 @@ class Regressor(Estimator):
 
     @abstractmethod
     def importances(self) -> Float64:
-        """(f,) how much each of `factors` matters in all; at least 0, their sum is 1, or 0 where
-        nothing was learnt.
+        """(f,) how much each of `factors` matters in what was learnt; at least 0, their sum is 1,
+        or 0 where nothing was learnt of them.
         """
+
+    def learnt(self) -> Mapping[str, float]:
+        """Numbers of it that a reader of the facts of a model asks for, by name."""
+        return {}
 
     @abstractmethod
     def save(self) -> Any:

@@ -45,9 +45,12 @@ class Protocol:
 
 
 def random_split(dataset: Dataset, seed: int = 0) -> list[Split]:
-    """The paper's: a random quarter of the points is held out. It leaks at a spacing of 1 m."""
-    order = np.random.default_rng(seed).permutation(len(dataset))
-    cut = len(dataset) - round(0.25 * len(dataset))
+    """The paper's: a random quarter of the points is held out, each path as one drive has it. It
+    leaks at a spacing of 1 m.
+    """
+    rows = dataset.rows_of_one_drive()
+    order = rows[np.random.default_rng(seed).permutation(len(rows))]
+    cut = len(rows) - round(0.25 * len(rows))
     return [Split("random quarter", np.sort(order[:cut]), np.sort(order[cut:]))]
 
 
@@ -74,8 +77,27 @@ def block_splits(dataset: Dataset, folds: int = FOLDS, buffer: float = BUFFER) -
     names = np.unique(blocks)
     if len(names) < 2:
         raise ModelError(f"one block only ({names[0]}): the drive is too short to be divided")
+    return _dealt(dataset, blocks, folds, buffer)
+
+
+def nested_splits(dataset: Dataset, folds: int) -> list[Split]:
+    """Splits of what trains: whole paths dealt in turn into folds, as an unseen street is what has
+    to be estimated; of fewer than three paths, blocks.
+
+    Raises:
+        ModelError: a single block, or too few points left to train.
+    """
+    paths = dataset.rows["path"].to_numpy(str)
+    if len(np.unique(paths)) < 3:
+        return block_splits(dataset, folds)
+    return _dealt(dataset, paths, folds, BUFFER)
+
+
+def _dealt(dataset: Dataset, units: NDArray[np.str_], folds: int, buffer: float) -> list[Split]:
+    """Units, by (n,) names, dealt in turn into folds."""
+    names = np.unique(units)
     folds = min(folds, len(names))
-    fold = np.searchsorted(names, blocks) % folds
+    fold = np.searchsorted(names, units) % folds
     return [_held_out(dataset, f"fold {k}", fold == k, buffer) for k in range(folds)]
 
 

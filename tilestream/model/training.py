@@ -16,6 +16,7 @@ from tilestream.model.domain import Domain, domain_of
 from tilestream.model.explain import PIECE, Typical, compared, in_words, typical_of
 from tilestream.model.features import with_derived
 from tilestream.model.intervals import LEVEL, NOT_CALIBRATED, Interval, calibrate
+from tilestream.model.physics import width_of
 from tilestream.model.registry import DEFAULT, REGRESSORS
 from tilestream.model.regressor import Regressor, held_out_estimates
 from tilestream.model.splits import block_splits
@@ -67,7 +68,7 @@ PREDICTION_COLUMNS = (
         "place",
         "",
         "Why the estimate is high, the place strange, or there is no estimate; else empty.",
-        "contributions along the trees' paths; factors on their bad side",
+        "contributions to the estimate; factors on their bad side",
         dtype="str",
     ),
 )
@@ -92,6 +93,8 @@ class Model:
     """What the factors were computed with: sensor, cell size, units, … (`check_making`)."""
     data_set: Mapping[str, Any]
     """Identity of the labels: matcher, starts, true pose, cell size, sensor."""
+    width: float
+    """Over what virtual drives are averaged along the route (`averaged_along`) [m]."""
     worst: float
     """Estimates above this are given a reason [m]."""
     facts: Mapping[str, Any]
@@ -117,6 +120,8 @@ def train(
         raise UsageError(f"no recipe {recipe!r}: choose from {', '.join(sorted(REGRESSORS))}")
     regressor = REGRESSORS[recipe]
     dataset.check(MAIN)
+    width = width_of(dataset)
+    dataset = dataset.averaged(width)
     pieces = dataset.rows.groupby(["path", dataset.rows["arc_length"] // PIECE]).ngroups
     whole, dataset = dataset, dataset.with_columns(regressor.features(dataset.columns))
     rows = dataset.rows
@@ -126,18 +131,22 @@ def train(
     settings = regressor.tuned(dataset, MAIN, seed, n_jobs)
     # An axis or a tail that is the same everywhere teaches nothing and is learnt as that constant.
     there = [target for target in TARGETS if target in dataset.rows]
+    regressors = {t: regressor.fit(dataset, t, seed, settings, n_jobs) for t in there}
+    learnt = {target: dict(one.learnt()) for target, one in regressors.items() if one.learnt()}
     return Model(
-        regressors={t: regressor.fit(dataset, t, seed, settings, n_jobs) for t in there},
+        regressors=regressors,
         domain=domain,
         typical=typical,
         interval=_interval(dataset, regressor, settings, seed, n_jobs),
         factors=tuple(dataset.names),
         made_with=dataset.made_with,
         data_set=next(iter(dataset.data_sets.values()), {}),
+        width=width,
         worst=float(np.quantile(dataset.label(MAIN), WORST)),
         facts={
             "recipe": recipe,
             **settings,
+            **({"learnt": learnt} if learnt else {}),
             "seed": seed,
             "points": len(dataset),
             "groups": sorted(set(rows["group"])),
@@ -157,9 +166,9 @@ def _interval(
 ) -> Interval:
     """The interval, from estimates of blocks that the regressor has not seen.
 
-    The settings were chosen on these blocks too, so the interval is a little narrower than one
-    whose settings had been chosen anew for each fold. The effect is small: a held-out block only
-    had a part in choosing one of a few candidates.
+    Settings and width were chosen on these blocks too, so the interval is a little narrower than
+    one for which they had been chosen anew for each fold. The effect is small: a held-out block
+    only had a part in choosing one of a few candidates.
     """
     try:
         splits = block_splits(dataset)

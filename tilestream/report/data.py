@@ -17,7 +17,7 @@ from tilestream.report.drives import DriveMeasured
 
 PLACE_COLUMNS = ("route_id", "sample", "arc_length", "heading", "x", "y", "z")
 """Where a sample point is: its route, its number there, and the map frame [m, rad]."""
-LABEL_COLUMNS = ("group", "path", "arc_length", "error_mean", "held_out")
+LABEL_COLUMNS = ("group", "path", "block", "arc_length", "error_mean", "held_out", "low", "high")
 """What a labelled place must have."""
 AROUND = 40.0
 """How far round a place its picture reaches [m]."""
@@ -46,9 +46,8 @@ class Findings:
     the factors."""
     labels: pd.DataFrame = field(default_factory=_none)
     """A row per drive and labelled place: `Dataset.rows`, and `held_out` [m]: the estimate by a
-    model that has not seen the place's path; NaN where there is none. `low` and `high` [m] where
-    that model has an interval of its own; else it is the factor of `coverage`.
-    A row that repeats another in every column counts once."""
+    model that has not seen the place's path, and `low` and `high` [m], the ends of its interval;
+    NaN where there is none. A row that repeats another in every column counts once."""
     protocols: pd.DataFrame = field(default_factory=_none)
     """`evaluation.figures_by_protocol` of the mean error, of every model."""
     parts: pd.DataFrame = field(default_factory=_none)
@@ -56,14 +55,17 @@ class Findings:
     table_iv: pd.DataFrame = field(default_factory=_none)
     """The same of each factor set, with the column `factors`: its name."""
     importances: pd.DataFrame = field(default_factory=_none)
-    """`evaluation.importances_of`, with the column `model`: `used` of the forest that made the
+    """`evaluation.importances_of`, with the column `model`: `used` of the model that made the
     estimates, `paper` of the paper's on its own factors."""
     criterion_importances: pd.DataFrame = field(default_factory=_none)
     """`evaluation.criterion_importances`, likewise; `paper` on all factors."""
     coverage: pd.DataFrame = field(default_factory=_none)
     """`intervals.coverage`."""
+    differences: pd.DataFrame = field(default_factory=_none)
+    """`evaluation.differences_by_protocol` of the model in use and physics, with the column
+    `target`."""
     ceilings: dict[str, dict[str, float]] = field(default_factory=dict)
-    """The fields of `evaluation.ceiling`'s figures by target; empty without a repeated drive."""
+    """`repeats.repeated` by target; empty without a repeated drive."""
     model: str = DEFAULT
     """Which of the models of `protocols` has made the estimates; one that is not among them was
     trained elsewhere."""

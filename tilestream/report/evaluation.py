@@ -109,18 +109,23 @@ def _mae(row: Row) -> float:
     return float(row["mae"])
 
 
-def held(coverage: Sequence[Row]) -> dict[str, float] | None:
-    """What intervals promised and held: `level`, `covered` (every point counting the same), `low`
-    and `high` by path; None where no path was evaluated.
+def on_all(coverage: Sequence[Row]) -> Row | None:
+    """What intervals held on all points (the row without a path), and `low` and `high` by path;
+    None where no path was evaluated.
     """
-    rows = [row for row in coverage if known(row["covered"])]
-    if not rows:
+    rows = [row for row in coverage if row["path"] and known(row["covered"])]
+    every = [row for row in coverage if not row["path"] and known(row["covered"])]
+    if not rows or not every:
         return None
     covered = [row["covered"] for row in rows]
-    points = sum(row["points"] for row in rows)
-    return {
-        "level": sum(row["level"] for row in rows) / len(rows),
-        "covered": sum(row["covered"] * row["points"] for row in rows) / points,
-        "low": min(covered),
-        "high": max(covered),
-    }
+    return {**every[0], "low": min(covered), "high": max(covered)}
+
+
+def worth(row: Row) -> str:
+    """What a paired difference says, in words."""
+    low, high = row["skill_low"], row["skill_high"]
+    if not (known(low) and known(high)):
+        return "not known: one block"
+    if low > 0.0:
+        return "better"
+    return "worse" if high < 0.0 else "no difference that is sure"

@@ -29,7 +29,7 @@ def path_lines(found: Findings, path: str) -> PathLines:
     """Measured error of each drive along a path, and the estimate of a model without it."""
     labels = found.labels[found.labels["path"].astype(str) == path]
     drives = {str(group): _measured(part) for group, part in labels.groupby("group", sort=True)}
-    return PathLines(drives, _estimated(labels, interval_factor(found.coverage, path)))
+    return PathLines(drives, _estimated(labels))
 
 
 def _measured(part: pd.DataFrame) -> dict[str, Any]:
@@ -42,8 +42,8 @@ def _measured(part: pd.DataFrame) -> dict[str, Any]:
     }
 
 
-def _estimated(labels: pd.DataFrame, factor: float | None) -> dict[str, Any]:
-    along = held_out_along(labels, factor)
+def _estimated(labels: pd.DataFrame) -> dict[str, Any]:
+    along = held_out_along(labels)
     arc = along["arc_length"].to_numpy(np.float64)
     breaks = with_gaps(arc)
     names = ("held_out", "low", "high", "error_mean")
@@ -69,28 +69,16 @@ def _estimated(labels: pd.DataFrame, factor: float | None) -> dict[str, Any]:
     return broken | {k: np.insert(v, breaks, "").tolist() for k, v in words.items()}
 
 
-def interval_factor(coverage: pd.DataFrame, path: str) -> float | None:
-    """The factor of a path's interval, calibrated on the other paths; None where there is none."""
-    if coverage.empty:
-        return None
-    factor = coverage.loc[coverage["path"].astype(str) == path, "factor"].to_numpy(np.float64)
-    return float(factor[0]) if factor.size and np.isfinite(factor[0]) else None
-
-
-def held_out_along(labels: pd.DataFrame, factor: float | None) -> pd.DataFrame:
+def held_out_along(labels: pd.DataFrame) -> pd.DataFrame:
     """The held-out estimate of each labelled place of a path: drives over a place share it.
 
     Args:
         labels: of one path.
-        factor: of its interval (`interval_factor`), where the labels have no `low` and `high`.
 
     Returns:
         A row per `arc_length` [m], rising, with `held_out`, `low`, `high` (NaN where there is no
         interval) and `error_mean` (of all drives) [m].
     """
-    if not {"low", "high"} <= set(labels):
-        held, wide = labels["held_out"], np.nan if factor is None else factor
-        labels = labels.assign(low=held / wide, high=held * wide)
     names = ["held_out", "low", "high", "error_mean"]
     return labels.groupby("arc_length", as_index=False)[names].mean()
 

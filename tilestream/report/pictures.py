@@ -191,9 +191,10 @@ def coverage_figure(coverage: pd.DataFrame) -> Figure:
     axes = figure.add_subplot()
     row = np.arange(len(coverage))[::-1]
     covered, level = (coverage[c].to_numpy(np.float64) for c in ("covered", "level"))
-    axes.barh(row, covered, color=ACTUAL, height=0.6, label="inside")
+    error = np.nan_to_num(coverage["error"].to_numpy(np.float64))
+    axes.barh(row, covered, color=ACTUAL, height=0.6, label="inside", xerr=error)
     axes.plot(level, row, "|", color=HELD_OUT, ms=18, mew=2.5, label="promised")
-    axes.set_yticks(row, coverage["path"].astype(str), parse_math=False)
+    axes.set_yticks(row, coverage["path"].replace("", "all").astype(str), parse_math=False)
     axes.set(xlim=(0.0, 1.0), xlabel="share of the measured errors inside the interval")
     axes.legend(frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
     return figure

@@ -7,18 +7,20 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from tilestream.model.evaluation import PAPER_TABLE, figures
+from tilestream.model.evaluation import PAPER_TABLE
+from tilestream.model.figures import with_spans
 from tilestream.model.training import PREDICTION_COLUMNS
 from tilestream.records import Float64, Int64
 from tilestream.report.data import PLACE_COLUMNS, Findings, estimates, like_training
 from tilestream.report.formatting import cm, distance, known, percent, thousands
-from tilestream.report.lines import held_out_along, interval_factor
 from tilestream.report.paper_tables import paper_table_i, paper_table_iii, table_i, table_iii
 from tilestream.report.segments import reaches, segments, worst_measured, worst_places
 from tilestream.version import VERSION
 
 THRESHOLDS = (0.05, 0.10, 0.15, 0.20, 0.25, 0.50)
 """Errors that people ask for [m]: the paper's Table I, and around them."""
+OF_PATH = ("mae", "spearman", "spearman_low", "spearman_high")
+"""How the estimates of a labelled path are told."""
 AXES, STARTS = ("along", "across", "up"), ("floor", "tail")
 """The parts of an estimate [m]: by direction; of the starts nearby, and what farther ones add."""
 
@@ -53,6 +55,7 @@ def summary(found: Findings, threshold: float) -> dict[str, Any]:
         "criterion_importances": found.criterion_importances.to_dict("records"),
         "coverage": found.coverage.to_dict("records"),
         "parts": found.parts.to_dict("records"),
+        "differences": found.differences.to_dict("records"),
         "ceilings": found.ceilings,
         "model": found.model,
         "facts": found.facts,
@@ -197,23 +200,20 @@ def paths(found: Findings) -> list[dict[str, Any]]:
     for name, part in found.labels.groupby("path", sort=True):
         actual, held = (part[c].to_numpy(np.float64) for c in ("error_mean", "held_out"))
         evaluated = np.isfinite(actual) & np.isfinite(held)
-        factor = interval_factor(found.coverage, str(name))
         row = {
             "path": str(name),
             "points": len(part),
             "groups": sorted(set(part["group"].astype(str))),
             "judged": int(evaluated.sum()),
-            "factor": factor,
-            "interval": bool(held_out_along(part, factor)["low"].notna().any()),
+            "interval": bool(part["low"].notna().any()),
             "actual_median": float(np.nanmedian(actual)),
             "estimate_median": float(np.median(held[evaluated])) if evaluated.any() else None,
-            "mae": None,
-            "spearman": None,
+            **dict.fromkeys(OF_PATH),
         }
         if evaluated.any():
-            median = np.full(int(evaluated.sum()), np.median(actual[evaluated]))
-            of = figures(actual[evaluated], held[evaluated], median)
-            row |= {"mae": of.mae, "spearman": of.spearman}
+            here = part[evaluated].rename(columns={"error_mean": "actual", "held_out": "estimate"})
+            of = with_spans(here.assign(median=here["actual"].median(), fold=""))
+            row |= {name: of[name] for name in OF_PATH}
         rows.append(row)
     return rows
 

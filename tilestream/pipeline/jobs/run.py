@@ -39,8 +39,9 @@ from tilestream.pipeline.jobs.run_book import (
     told_before,
     write_text,
 )
-from tilestream.pipeline.jobs.run_findings import Done, findings_of, heights_told
+from tilestream.pipeline.jobs.run_findings import Done, findings_of, heights_told, offset_told
 from tilestream.pipeline.jobs.run_inputs import (
+    JOB,
     Inputs,
     check_model,
     inputs_of,
@@ -289,7 +290,7 @@ def _report(settings: RunSettings, inputs: Inputs, story: _Story, book: Book) ->
     book.facts["drives"] = [drive.plain() for drive in measured]
     if not done.outputs("factors"):
         return
-    told = (heights_told(done, settings), log_poses_told(done))
+    told = ({JOB: offset_told(done, settings)}, heights_told(done, settings), log_poses_told(done))
     book.facts["notes"] = noticed(book.facts["notes"], *told)
     known = done.dataset()
     if known is not None:
@@ -298,7 +299,7 @@ def _report(settings: RunSettings, inputs: Inputs, story: _Story, book: Book) ->
         done,
         story.store,
         known,
-        _facts(settings, inputs, book, known),
+        _facts(settings, inputs, book, known, done),
         settings,
         seen_otherwise(settings, inputs.drives),
     )
@@ -317,7 +318,7 @@ def _report(settings: RunSettings, inputs: Inputs, story: _Story, book: Book) ->
 
 
 def _facts(
-    settings: RunSettings, inputs: Inputs, book: Book, known: Dataset | None
+    settings: RunSettings, inputs: Inputs, book: Book, known: Dataset | None, done: Done
 ) -> dict[str, Any]:
     """What a reader of the report must know of the run, and what makes the same figures again."""
     stages = {name: f"{row['core_seconds']:.1f} s" for name, row in book.stages().items()}
@@ -329,7 +330,7 @@ def _facts(
         "map": settings.store_url,
         "sensor": settings.vehicle.name,
         "labelled places": 0 if known is None else len(known),
-        "model": _model_facts(settings, book),
+        "model": _model_facts(settings, done),
         "matcher": {
             "name": settings.label.registration.told,
             **settings.label.registration.model_dump(),
@@ -342,12 +343,14 @@ def _facts(
     }
 
 
-def _model_facts(settings: RunSettings, book: Book) -> dict[str, Any]:
+def _model_facts(settings: RunSettings, done: Done) -> dict[str, Any]:
     """Where the model comes from, and how it was grown."""
-    if settings.model.untrained:
-        return {"from": "none: the virtual drive as it is", "offset [m]": settings.model.offset}
+    along = {"averaged along the route over [m]": done.width}
+    if settings.model.untrained(done.labelled):
+        offset = settings.model.offset or 0.0
+        return {"from": "none: the virtual drive as it is", "offset [m]": offset, **along}
     if settings.model.use is not None:
-        return {"from": settings.model.use, **load_model(settings.model.use).facts}
-    if not any(outcome.stage == "train" and outcome.ok for outcome in book.outcomes):
+        return {"from": settings.model.use, **load_model(settings.model.use).facts, **along}
+    if not done.outputs("train"):
         return {"from": "none: it could not be trained", "recipe": settings.model.recipe}
-    return {"from": "trained here", **load_model(f"{settings.out}/model.skops").facts}
+    return {"from": "trained here", **load_model(f"{settings.out}/model.skops").facts, **along}

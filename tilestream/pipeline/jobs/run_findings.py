@@ -1,20 +1,26 @@
 """What the main job found: the tables of a run directory, gathered for its report."""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from tilestream.errors import ModelError
+from tilestream.factors.along_route import WIDTH
 from tilestream.factors.heights import note_of_drive, notes_of_routes
-from tilestream.factors.virtual_drive import physics
 from tilestream.grid import MM_PER_M, Box
-from tilestream.model.dataset import TARGETS, Dataset, nearest_along
-from tilestream.model.evaluation import ceiling, factor_sets, figures_by_protocol
-from tilestream.model.intervals import coverage
-from tilestream.model.registry import REGRESSORS
+from tilestream.model.dataset import POINTS_MIN, TARGETS, Dataset, nearest_along
+from tilestream.model.evaluation import (
+    differences_by_protocol,
+    factor_sets,
+    figures_by_protocol,
+)
+from tilestream.model.intervals import coverage, with_intervals
+from tilestream.model.physics import Physics
+from tilestream.model.registry import REGRESSORS, UNTRAINED
+from tilestream.model.repeats import repeated
 from tilestream.model.training import MAIN, PREDICTION_COLUMNS
 from tilestream.pipeline.engine.plan import paths_of
 from tilestream.pipeline.engine.stage import Task
@@ -27,10 +33,7 @@ from tilestream.store import TileStore
 from tilestream.tables import read_tables
 
 PLACE = ["route_id", "sample"]
-_NO_POINTS = pd.DataFrame(
-    {"path": pd.Series(dtype=str)}
-    | {name: pd.Series(dtype=np.float64) for name in ("arc_length", "estimate")}
-)
+_NO_POINTS = pd.DataFrame({name: [] for name in ("row", "estimate", "low", "high")})
 """Where nothing could be held out."""
 
 
@@ -58,13 +61,28 @@ class Done:
             for t in self.outputs("evaluate")
         }
 
+    @property
+    def labelled(self) -> int:
+        """How many places were measured, or could not be."""
+        return sum(task.work for task in self.outputs("label"))
+
+    @property
+    def width(self) -> float:
+        """Over what the virtual drives of the estimates are averaged along the route [m]."""
+        for task in self.outputs("predict")[:1]:
+            model = task.reads.get("model")
+            if model is not None and not isinstance(model, tuple):
+                return float(model.read().width)
+        return WIDTH
+
 
 def places_of(done: Done) -> pd.DataFrame:
     """Every sample point with its factors and its estimate, or why it has none."""
     factors, observed = (
         [task.writes.read() for task in done.outputs(stage)] for stage in ("factors", "observe")
     )
-    places = places_with_factors(factors, observed).drop(columns=["status", "reason"])
+    places = places_with_factors(factors, observed, done.width)
+    places = places.drop(columns=["status", "reason"])
     tables = paths_of(done.outputs("predict"))
     names = [column.name for column in PREDICTION_COLUMNS]
     if tables:
@@ -93,6 +111,15 @@ def heights_told(done: Done, settings: RunSettings) -> dict[str, list[str]]:
     return notes
 
 
+def offset_told(done: Done, settings: RunSettings) -> list[str]:
+    """A note where the virtual drive as it is makes the estimates, and nobody asked for that."""
+    model, labelled = settings.model, done.labelled
+    if not labelled or model.offset is not None or not model.untrained(labelled):
+        return []
+    told = f"{labelled} places are measured, and a model needs {POINTS_MIN}: the estimates are the"
+    return [f"{told} virtual drive as it is (model.offset 0)."]
+
+
 def labels_of(
     dataset: Dataset | None,
     places: pd.DataFrame,
@@ -106,8 +133,8 @@ def labels_of(
     Args:
         dataset: what was measured.
         places: every sample point.
-        points: held-out points of the model that leaves paths out; None: the model in use was
-            trained elsewhere, so that its estimates are held out as they are.
+        points: held-out points of the model that leaves paths out, with intervals; None: the model
+            in use was trained elsewhere, so that its estimates are held out as they are.
         reach: how far along the path of a label that may have been said [m].
         own: groups of labels that were seen with another lidar than the vehicle's, for which the
             estimates of `places` are. Without `points` they have that of their own virtual drive,
@@ -116,17 +143,18 @@ def labels_of(
     """
     if dataset is None:
         return pd.DataFrame()
-    if points is None:
-        said = places.rename(columns={"route_id": "path", "estimate": "held_out"})
-    else:
-        said = points.rename(columns={"estimate": "held_out"})
-    kept = ["held_out"] if points is not None else ["held_out", "low", "high"]
-    found = nearest_along(dataset.rows, said[["path", "arc_length", *kept]], reach)
-    if points is None and own:
-        others = found["group"].isin(list(own))
-        found.loc[others, kept] = np.nan
-        if offset is not None:
-            found.loc[others, "held_out"] = physics(found["vd_mean"][others].to_numpy(), offset)
+    names = ["held_out", "low", "high"]
+    if points is not None:
+        said = points.set_index("row")[["estimate", "low", "high"]]
+        here = said.reindex(np.arange(len(dataset))).to_numpy(np.float64)
+        return dataset.rows.assign(**dict(zip(names, here.T, strict=True)))
+    said = places.rename(columns={"route_id": "path", "estimate": "held_out"})
+    found = nearest_along(dataset.rows, said[["path", "arc_length", *names]], reach)
+    others = found["group"].isin(list(own))
+    found.loc[others, names] = np.nan
+    if offset is not None:
+        physics = Physics.as_it_is(MAIN, offset)
+        found.loc[others, "held_out"] = physics.predict(found[others])
     return found
 
 
@@ -135,12 +163,13 @@ def evaluation_of(
     sets: Sequence[str],
     recipe: str,
 ) -> dict[str, pd.DataFrame]:
-    """Evaluations as tables: `protocols`, `table_iv`, `coverage`, and `parts` for other targets.
+    """Evaluations as tables: `protocols`, `table_iv`, `coverage`, `parts` for other targets, and
+    `differences` between the model in use and physics.
 
     Args:
         found: what was evaluated (`Done.evaluations`).
         sets: the factor sets of Table IV in its order; the last has all factors.
-        recipe: the model whose intervals are checked.
+        recipe: the model in use.
     """
     rows = {key: figures_by_protocol(points, key[1]) for key, points in found.items()}
     protocols = [
@@ -154,11 +183,18 @@ def evaluation_of(
         if (MAIN, model, chosen) in rows
     ]
     parts = [table.assign(target=t) for (t, _, _), table in rows.items() if t != MAIN]
+    differences = [
+        differences_by_protocol(points, found[target, UNTRAINED, ""]).assign(target=target)
+        for (target, model, chosen), points in found.items()
+        if (model, chosen) == (recipe, "") and recipe != UNTRAINED
+        if (target, UNTRAINED, "") in found
+    ]
     held = found.get((MAIN, recipe, ""), {}).get("path", "")
     return {
         "protocols": _joined(protocols),
         "table_iv": _joined(four),
         "parts": _joined(parts),
+        "differences": _joined(differences),
         "coverage": pd.DataFrame() if isinstance(held, str) else coverage(held),
     }
 
@@ -168,12 +204,14 @@ def _joined(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
 
 
 def ceilings(dataset: Dataset | None, targets: Sequence[str]) -> dict[str, dict[str, float]]:
-    """What a repeated drive knows of each target; empty without one."""
+    """What a repeated drive knows of each target, and what any estimate could know (`repeated`);
+    empty without one.
+    """
     found: dict[str, dict[str, float]] = {}
     for target in targets:
         if dataset is not None and target in dataset.rows:
             try:
-                found[target] = asdict(ceiling(dataset, target))
+                found[target] = repeated(dataset, target)
             except ModelError:
                 return {}
     return found
@@ -199,27 +237,29 @@ def findings_of(
     sets = [] if dataset is None else list(factor_sets(dataset.columns))
     tables = evaluation_of(found, sets, model.recipe)
     held = found.get((MAIN, model.recipe, ""), {}).get("path")
-    points = held if isinstance(held, pd.DataFrame) else _NO_POINTS
+    points = with_intervals(held) if isinstance(held, pd.DataFrame) else _NO_POINTS
     weights = paths_of(done.outputs("importance"))
     weighed = read_tables(weights) if weights else pd.DataFrame({"factor": []})
     ceiling_of = ceilings(dataset, TARGETS)
-    trained_here = model.use is None and not model.untrained
+    untrained = model.untrained(done.labelled)
+    trained_here = model.use is None and not untrained
     gathered = Findings(
         title=settings.report.title or settings.folder.name,
         places=places,
         labels=labels_of(
-            dataset,
+            None if dataset is None else dataset.averaged(done.width),
             places,
             points if trained_here else None,
             settings.spacing,
             otherwise,
-            model.offset if model.untrained else None,
+            (model.offset or 0.0) if untrained else None,
         ),
         protocols=tables["protocols"],
         table_iv=tables["table_iv"],
         importances=weighed[weighed["factor"] != ""].reset_index(drop=True),
         criterion_importances=weighed[weighed["factor"] == ""].reset_index(drop=True),
         coverage=tables["coverage"],
+        differences=tables["differences"],
         parts=tables["parts"],
         ceilings=ceiling_of,
         model="" if model.use else model.recipe,

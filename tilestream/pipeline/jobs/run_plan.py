@@ -6,14 +6,14 @@ from typing import Any
 
 from tilestream.errors import SourceError, SourceNotFoundError, TileNotReadyError
 from tilestream.factors import catalogue
-from tilestream.factors.virtual_drive import NEIGHBOURS
+from tilestream.factors.along_route import REACH
 from tilestream.grid import MM_PER_M, TileGrid, TileKey
 from tilestream.model.baselines import Median
 from tilestream.model.dataset import TARGETS
 from tilestream.model.evaluation import factor_sets
 from tilestream.model.features import features_of
 from tilestream.model.forest import PaperForest
-from tilestream.model.registry import COMPETITORS, REGRESSORS, UNTRAINED
+from tilestream.model.registry import COMPETITORS, OF_VIRTUAL_DRIVES, REGRESSORS, UNTRAINED
 from tilestream.model.training import MAIN
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.outputs import Parquet
@@ -46,7 +46,7 @@ OF_DRIVES = (factors_drive.name, observe_drive.name)
 OPPONENT = Median.name
 """What the estimates of a part of the error are compared with: the others know no more of unseen
 paths."""
-NEIGHBOURS_MM = round(NEIGHBOURS * MM_PER_M) + 1
+NEIGHBOURS_MM = round(REACH * MM_PER_M) + 1
 """How far from a tile a sample point of it may have neighbours, rounding included [mm]."""
 
 
@@ -161,7 +161,7 @@ def plan_estimate(
         seen = {task.tile for task in observed}
         factors = [task for task in factors if task.tile in seen]
     tasks: list[Task] = []
-    known, model = _model_there(settings)
+    known, model = _model_there(settings, sum(task.work for task in labels))
     if labels and factors:
         of_drives = [task for task in measure.tasks if task.stage in OF_DRIVES and task.key in done]
         joined = _samples(settings, factors, of_drives, labels)
@@ -176,9 +176,9 @@ def plan_estimate(
     return Plan.of(tasks, settings.memory)
 
 
-def _model_there(settings: RunSettings) -> tuple[bool, Readable | None]:
+def _model_there(settings: RunSettings, labelled: int) -> tuple[bool, Readable | None]:
     """Whether nothing has to be trained, and the model in use; None: the virtual drive as it is."""
-    if settings.model.untrained:
+    if settings.model.untrained(labelled):
         return True, None
     if settings.model.use is None:
         return False, None
@@ -250,12 +250,12 @@ def _evaluations(settings: RunSettings, joined: Task, observed: bool) -> list[Ta
     columns = features_of(COLUMNS if observed else catalogue.COLUMNS)
     *sets, _ = factor_sets(columns)  # the last has all factors, as the competitors have
     virtual = [UNTRAINED] if observed else []
-    wanted = [(MAIN, name, "") for name in COMPETITORS if observed or name != UNTRAINED]
+    wanted = [(MAIN, name, "") for name in COMPETITORS if observed or name not in OF_VIRTUAL_DRIVES]
     wanted += [(MAIN, PaperForest.name, name) for name in sets]
     whole = [name for name in sets if "LS" in name and "ob" not in name]
-    others = [name for name in REGRESSORS if name != PaperForest.name]
+    others = [name for name in REGRESSORS if name not in (PaperForest.name, *OF_VIRTUAL_DRIVES)]
     wanted += [(MAIN, other, name) for other in others for name in whole]
-    of_parts = [model.recipe, *virtual, OPPONENT]
+    of_parts = dict.fromkeys([model.recipe, *virtual, OPPONENT])
     wanted += [(target, name, "") for target in TARGETS if target != MAIN for name in of_parts]
     tasks = []
     for target, competitor, factor_set in wanted:
@@ -305,7 +305,7 @@ def _predictions(
                 predict,
                 str(task.tile),
                 Parquet(f"{settings.out}/tables/predictions/{task.tile}.parquet"),
-                takes={"making": making, "offset": settings.model.offset},
+                takes={"making": making, "offset": settings.model.offset or 0.0},
                 reads={**reads, "factors": task.product, "observed": _products(near)},
                 work=task.work,
                 counts={"places": sum(one.work for one in (task, *near))},

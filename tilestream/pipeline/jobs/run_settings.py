@@ -13,7 +13,8 @@ from tilestream.config import Settings
 from tilestream.errors import SourceNotFoundError, UsageError, foreign_errors
 from tilestream.files import Files, local_path
 from tilestream.matcher import RegistrationSettings, matcher_named
-from tilestream.model.registry import COMPETITORS, DEFAULT, RECIPES, UNTRAINED
+from tilestream.model.dataset import POINTS_MIN
+from tilestream.model.registry import DEFAULT, OF_VIRTUAL_DRIVES, REGRESSORS, UNTRAINED
 from tilestream.settings import (
     NAME,
     DriveSettings,
@@ -29,8 +30,8 @@ from tilestream.settings import (
 
 
 def _known(recipe: str) -> str:
-    if recipe not in RECIPES:
-        raise ValueError(f"is {recipe!r}: choose from {', '.join(RECIPES)}")
+    if recipe not in REGRESSORS:
+        raise ValueError(f"is {recipe!r}: choose from {', '.join(REGRESSORS)}")
     return recipe
 
 
@@ -39,8 +40,8 @@ Recipe = Annotated[
     AfterValidator(_known),
     Field(
         description="What estimates the error: "
-        + "; ".join(f"`{name}` ({COMPETITORS[name].words})" for name in RECIPES)
-        + f". All but `{UNTRAINED}` are trained on the drives."
+        + "; ".join(f"`{name}` ({one.words})" for name, one in REGRESSORS.items())
+        + f". They are trained on the drives; `{UNTRAINED}` needs none."
     ),
 ]
 """Name of a regressor."""
@@ -50,17 +51,22 @@ class ModelSettings(Settings):
     """How the errors of the measured places become those of all places."""
 
     recipe: Recipe = DEFAULT
-    offset: Annotated[float, Field(ge=0.0)] = 0.0
-    """With `physics`: what a real scan adds to the error of a virtual one [m]."""
+    offset: Annotated[float, Field(ge=0.0)] | None = None
+    """With `physics`: what a real scan adds to the error of a virtual one [m]; nothing is trained
+    then. Not given: the drives tell it, 0 where fewer than 50 places are measured."""
     use: Place | None = None
     """A model file to use instead of training; null: train on the drives."""
     seed: int = 0
     """Seed of all that is random in training."""
 
-    @property
-    def untrained(self) -> bool:
-        """Whether the virtual drive as it is makes the estimates."""
-        return self.recipe == UNTRAINED
+    def untrained(self, labelled: int) -> bool:
+        """Whether the virtual drive as it is makes the estimates.
+
+        Args:
+            labelled: how many places are measured.
+        """
+        told = self.offset is not None or labelled < POINTS_MIN
+        return self.recipe == UNTRAINED and self.use is None and told
 
 
 class RunSettings(PlaceSettings):
@@ -125,11 +131,16 @@ class RunSettings(PlaceSettings):
             raise ValueError(f"has two drives named {', '.join(twice)}: give each its own name")
         if self.simulate is None and not self.map.sources and self.map.store is None:
             raise ValueError("has no map: give map.sources (files), map.store, or simulate")
-        untrained = self.model.untrained
-        if not (self.simulate or self.drives or self.model.use or untrained):
+        recipe, use = self.model.recipe, self.model.use
+        if not (self.simulate or self.drives or use or recipe == UNTRAINED):
             raise ValueError("has nothing to learn from: give drives, simulate, or model.use")
-        if untrained and (self.observe is None or self.model.use):
-            raise ValueError(f"has model.recipe {UNTRAINED}, which needs observe and no model.use")
+        if recipe in OF_VIRTUAL_DRIVES and self.observe is None and not use:
+            others = ", ".join(name for name in REGRESSORS if name not in OF_VIRTUAL_DRIVES)
+            raise ValueError(
+                f"has model.recipe {recipe}, which needs observe: give observe, or one of {others}"
+            )
+        if recipe == UNTRAINED and use:
+            raise ValueError(f"has model.recipe {UNTRAINED} and model.use: give one of them")
         if not (self.simulate or self.drives or self.routes or self.map.sources):
             raise ValueError("has no routes: give files of routes, or drives")
         return self

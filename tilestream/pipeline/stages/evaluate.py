@@ -32,7 +32,7 @@ HELD_OUT_COLUMNS = (
 
 @stage(
     "evaluate",
-    version=5,
+    version=6,
     memory=lambda counts: FOREST_BYTES + BYTES_PER_ROW * counts["places"],
     seconds=45.0,
     columns=HELD_OUT_COLUMNS,
@@ -40,14 +40,16 @@ HELD_OUT_COLUMNS = (
 def evaluate(dataset: Dataset, competitor: str, target: str, factor_set: str, seed: int) -> Made:
     """The held-out points of every protocol with their estimates, or why there are none.
 
+    All drives of a path are held out together, and a model is evaluated on as many drives as it is
+    trained on: all of them.
+
     Args:
-        dataset: every path is taken once.
+        dataset: what was measured.
         competitor: which model or opponent.
         target: what is estimated.
         factor_set: name of the factors it may use (`evaluation.factor_sets`); empty: all.
         seed: of what is random.
     """
-    dataset = dataset.each_path_once()
     if factor_set:
         dataset = dataset.with_columns(factor_sets(dataset.columns)[factor_set])
     try:

@@ -16,7 +16,13 @@ WEIGHT_COLUMNS = (
     Column("model", "place", "", "`used`: the model in use; `paper`.", "", dtype="str"),
     Column("factor", "place", "", "The factor; empty: its whole criterion.", "", dtype="str"),
     Column("criterion", "place", "", "Its criterion.", "Table IV", dtype="str"),
-    Column("importance", "label", "1", "The regressor's own: they sum to 1.", "impurity decrease"),
+    Column(
+        "importance",
+        "label",
+        "1",
+        "The regressor's own: they sum to 1, or to 0.",
+        "impurity decrease",
+    ),
     Column("factors", "label", "1", "Factors of the criterion.", ""),
     Column("increase", "label", "m", "Of the error when the criterion is permuted.", "held out"),
     Column("spread", "label", "m", "Standard deviation of that over repeats.", ""),
@@ -25,7 +31,7 @@ WEIGHT_COLUMNS = (
 
 @stage(
     "importance",
-    version=4,
+    version=5,
     memory=lambda counts: FOREST_BYTES + BYTES_PER_ROW * counts["places"],
     seconds=100.0,
     columns=WEIGHT_COLUMNS,
@@ -34,7 +40,7 @@ def importance(dataset: Dataset, model: Model, seed: int) -> Made:
     """A row per factor and model with its importance, and one per criterion permuted.
 
     Args:
-        dataset: what was measured; every path is taken once.
+        dataset: what was measured.
         model: the one in use, trained on it.
         seed: of permutations and of what is fitted without held-out blocks.
 
@@ -42,8 +48,8 @@ def importance(dataset: Dataset, model: Model, seed: int) -> Made:
         ModelError: nothing can be learnt from this dataset. Without two blocks there are no rows
             of criteria; a fact of the table says why.
     """
-    dataset = dataset.each_path_once()
     dataset.check()
+    dataset = dataset.averaged(model.width)
     used = dataset.with_columns([c for c in dataset.columns if c.name in model.factors])
     papers = dataset.with_columns([c for c in dataset.columns if c.factor_set == "faithful"])
     main, paper = model.regressors[MAIN], PaperForest.fit(papers, MAIN, seed)

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from tilestream.factors.along_route import WIDTH
 from tilestream.factors.rows import PLACE_COLUMNS
-from tilestream.factors.virtual_drive import physics
 from tilestream.model.explain import without_training
-from tilestream.model.physics import VIRTUAL
+from tilestream.model.physics import Physics
 from tilestream.model.training import ESTIMATES, PREDICTION_COLUMNS, Model
 from tilestream.model.training import predict as predicted
 from tilestream.pipeline.engine.outputs import Stored
@@ -25,7 +25,7 @@ MODEL_BYTES = 300_000_000
 
 @stage(
     "predict",
-    version=4,
+    version=5,
     memory=lambda counts: MODEL_BYTES + BYTES_PER_ROW * counts["places"],
     seconds=0.004,
     columns=(*PLACE_COLUMNS, *PREDICTION_COLUMNS),
@@ -47,7 +47,7 @@ def predict(
         offset: without a model: what a real scan adds to the error of a virtual one [m].
         model: None: the virtual drive as it is.
     """
-    places = places_with_factors([factors], observed)
+    places = places_with_factors([factors], observed, WIDTH if model is None else model.width)
     found = physical(places, offset) if model is None else predicted(model, places, making)
     return pd.concat([places[[column.name for column in PLACE_COLUMNS]], found], axis=1)
 
@@ -60,10 +60,8 @@ def physical(places: pd.DataFrame, offset: float) -> pd.DataFrame:
     """
     good = places["status"] == "done"
     values: dict[str, Any] = {
-        ESTIMATES[target]: places[column] for target, column in VIRTUAL.items()
+        name: Physics.as_it_is(target, offset).predict(places) for target, name in ESTIMATES.items()
     }
-    for name in ("estimate", "floor"):
-        values[name] = physics(values[name], offset)
     blank = {c.name: np.nan for c in PREDICTION_COLUMNS if c.dtype == "float64"}
     frame = pd.DataFrame({**blank, **values}, index=places.index)
     frame.loc[~good, list(values)] = np.nan

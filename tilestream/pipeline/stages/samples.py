@@ -1,7 +1,7 @@
 """Samples: the factors, virtual drives and labels of the same places, joined once."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -10,10 +10,10 @@ import pandas as pd
 
 from tilestream.errors import DamagedError, SourceNotFoundError
 from tilestream.factors import catalogue, observability
-from tilestream.factors.rows import PLACE_COLUMNS
-from tilestream.factors.virtual_drive import averaged_along
+from tilestream.factors.along_route import AVERAGED, averaged_along
+from tilestream.factors.rows import PLACE_COLUMNS, STATUS_COLUMNS
 from tilestream.marks import Mark
-from tilestream.model.dataset import Dataset
+from tilestream.model.dataset import VIRTUAL_DRIVES, Dataset
 from tilestream.model.features import features_of
 from tilestream.model.join import join
 from tilestream.pipeline.engine.outputs import Facts, Made, Parquet, Stored
@@ -27,12 +27,19 @@ FOREST_BYTES = 500_000_000
 BYTES_PER_ROW = 10_000
 """Memory per sample point of a joined table: a thousand numbers in several copies."""
 
-MAY_BE_NAN = ("ob_cov_along", "ob_cov_across", "ob_cov_up", "ob_cov_yaw", "vd_median")
+MAY_BE_NAN = ("ob_cov_along", "ob_cov_across", "ob_cov_up", "ob_cov_yaw")
 """Columns of observability that are NaN at some places that have all others; no features, since a
 NaN among the features would leave such a place without an estimate."""
+
+
+def _is_feature(name: str) -> bool:
+    """Of the virtual drive what is averaged along the route; of the rest what is a number."""
+    return name in AVERAGED if name.startswith("vd_") else name not in MAY_BE_NAN
+
+
 COLUMNS = (
     *catalogue.COLUMNS,
-    *(column for column in observability.COLUMNS if column.name not in MAY_BE_NAN),
+    *(column for column in observability.COLUMNS if _is_feature(column.name)),
 )
 """All factors that a model may learn from."""
 DATASET_COLUMNS = (
@@ -49,9 +56,18 @@ LOST_COLUMNS = (
 )
 
 
+VIRTUAL_COLUMNS = tuple(
+    column
+    for column in (*DATASET_COLUMNS, *PLACE_COLUMNS, *STATUS_COLUMNS, *COLUMNS)
+    if column.name in VIRTUAL_DRIVES
+)
+
+
 @dataclass(frozen=True)
 class DatasetFile(Parquet):
-    """Where the dataset goes; what is lost goes to `lost.parquet` beside it, first."""
+    """Where the dataset goes; what is lost goes to `lost.parquet` beside it, first, and the virtual
+    drives of all places of the drives to `virtual_drives.parquet`.
+    """
 
     def known(self, identity: str) -> Facts | None:
         """As of any table."""
@@ -63,7 +79,10 @@ class DatasetFile(Parquet):
         dataset: Dataset = made.value
         frame = dataset.lost.astype({"sample": np.int64})
         frame = frame.assign(detail=frame["detail"].astype(str))
-        write_table(self._lost, frame, LOST_COLUMNS, Mark("done", identity=identity))
+        write_table(self._beside("lost"), frame, LOST_COLUMNS, Mark("done", identity=identity))
+        seen = dataset.virtual_drives.astype({"sample": np.int64})
+        beside = self._beside("virtual_drives")
+        write_table(beside, seen, VIRTUAL_COLUMNS, Mark("done", identity=identity))
         kept = (*DATASET_COLUMNS, *PLACE_COLUMNS, *ERROR_COLUMNS, *features_of(COLUMNS))
         names = {column.name for column in kept}
         rows = dataset.rows[[name for name in dataset.rows if name in names]]
@@ -77,8 +96,9 @@ class DatasetFile(Parquet):
         return {"rows": len(rows)}
 
     def files(self, identity: str) -> dict[str, str]:
-        """Both files."""
-        return {self._lost: identity, self.path: identity}
+        """All three files."""
+        names = (self._beside("lost"), self._beside("virtual_drives"), self.path)
+        return dict.fromkeys(names, identity)
 
     def read(self) -> Dataset:
         """The dataset; a process keeps the last one.
@@ -94,9 +114,8 @@ class DatasetFile(Parquet):
             raise SourceNotFoundError(f"{self.path}: no dataset; the job that joins it has not run")
         return _dataset(self, mark.identity)
 
-    @property
-    def _lost(self) -> str:
-        return f"{self.path.rsplit('/', 1)[0]}/lost.parquet"
+    def _beside(self, name: str) -> str:
+        return f"{self.path.rsplit('/', 1)[0]}/{name}.parquet"
 
 
 @lru_cache(maxsize=1)
@@ -104,13 +123,14 @@ def _dataset(file: DatasetFile, identity: str) -> Dataset:  # noqa: ARG001 - ano
     facts = read_mark(file.path).facts
     known = {column.name: column for column in features_of(COLUMNS)}
     columns = tuple(known[name] for name in facts["features"])
-    lost = read_tables([file._lost])
-    return Dataset(read_tables([file.path]), columns, lost, facts["made_with"], facts["data_sets"])
+    lost, seen = (read_tables([file._beside(name)]) for name in ("lost", "virtual_drives"))
+    rows = read_tables([file.path])
+    return Dataset(rows, columns, lost, facts["made_with"], facts["data_sets"], seen)
 
 
 @stage(
     "samples",
-    version=5,
+    version=6,
     memory=lambda counts: FOREST_BYTES + BYTES_PER_ROW * counts["places"],
     seconds=0.001,
 )
@@ -122,7 +142,7 @@ def samples(
     groups: Mapping[str, Sequence[str]],
     making: dict[str, Any],
 ) -> Dataset:
-    """The labels with the factors and virtual drives of their own places, as one dataset.
+    """The labels with the factors and virtual drives of their own places alone, as one dataset.
 
     Args:
         routes: tables of factors along the routes: what the paths are.
@@ -142,7 +162,7 @@ def samples(
         if name in of_group["observed"] or not observed
     }
     measured = of_group["labels"]
-    return join(
+    joined = join(
         _rows(routes),
         places,
         {name: _rows(tables) for name, tables in measured.items()},
@@ -150,6 +170,9 @@ def samples(
         made_with=making,
         data_sets={name: tables[0].facts["data_set"] for name, tables in measured.items()},
     )
+    seen = [_rows(tables).assign(group=name) for name, tables in of_group["observed"].items()]
+    names = list(VIRTUAL_DRIVES)
+    return replace(joined, virtual_drives=pd.concat(seen)[names]) if seen else joined
 
 
 def _by_group(tables: Sequence[Stored], groups: Sequence[str]) -> dict[str, list[Stored]]:
@@ -160,19 +183,25 @@ def _by_group(tables: Sequence[Stored], groups: Sequence[str]) -> dict[str, list
     return found
 
 
-def places_with_factors(factors: Sequence[Stored], observed: Sequence[Stored]) -> pd.DataFrame:
+def places_with_factors(
+    factors: Sequence[Stored], observed: Sequence[Stored], width: float = 0.0
+) -> pd.DataFrame:
     """Every sample point of the factor tables with all its factors.
 
-    A place that has the factors and could not be observed has NaN there, and says why. Virtual
-    drives are averaged along the route (`averaged_along`), so the tables of observability of the
-    tiles around have to be given too.
+    A place that has the factors and could not be observed has NaN there, and says why.
+
+    Args:
+        factors: tables of factors.
+        observed: tables of observability, of the places that may be neighbours too.
+        width: over what virtual drives are averaged along the route (`averaged_along`) [m].
     """
     places = _rows(factors)
     if not observed:
         return places
+    seen = averaged_along(_rows(observed), width)
     keys = ["route_id", "sample"]
-    names = [column.name for column in observability.COLUMNS]
-    seen = averaged_along(_rows(observed))[[*keys, *names, "status", "reason"]]
+    names = [column.name for column in observability.COLUMNS if column.name in seen]
+    seen = seen[[*keys, *names, "status", "reason"]]
     seen = seen.rename(columns={"status": "seen", "reason": "why"})
     joined = places.merge(seen, on=keys, how="left", validate="one_to_one")
     blind = (joined["status"] == "done") & (joined["seen"] != "done")
