@@ -165,7 +165,12 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a run of each pipeline, as small as a benchmark can read."""
     folder = tmp_path_factory.mktemp("runs")
     log = write_drive(folder / "canyon.mcap", "canyon")
-    few = ["label.starts={radius: 0.4, step: 0.2}", "observe.starts=16"]
+    few = [
+        "label.starts={radius: 0.4, step: 0.2}",
+        "observe.starts=16",
+        "observe.draws=2",
+        "observe.worlds=1",
+    ]
     city = [f"out={folder}/city", "simulate.size=small", "simulate.paths=[I, III]", "spacing=2"]
     ts.run(read_settings(ROOT / "pipelines" / "shinjuku.yaml", city + few))
     seen = f"{{log: {log}, every: 2, offset: 1}}"

@@ -32,7 +32,7 @@ from tilestream.tables import read_tables
 Told = pytest.CaptureFixture[str]
 
 SENSOR = ts.VLP16.model_copy(update={"name": "short", "azimuth_step_deg": 4.0})
-SEEING = VirtualSettings(starts=8)
+SEEING = VirtualSettings(starts=8, draws=2, worlds=1)
 HOW: dict[str, Any] = {"spacing": 8.0, "seeing": SEEING}
 CHOICES = choices_of([SENSOR], [8.0, 16.0], [0.0], [1.0, 2.0])
 CAP = 0.15

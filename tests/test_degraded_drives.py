@@ -37,7 +37,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> RunSettings:
         spacing=3.0,
         drives=[{"log": log, "name": "whole"}, {"log": log, "name": "short", "range_max": SHORT}],
         routes=[log],
-        observe={"range_max": USUAL, "starts": 8},
+        observe={"range_max": USUAL, "starts": 8, "draws": 2, "worlds": 1},
         model={"recipe": "physics", "offset": OFFSET},
     )
     ts.run(settings)

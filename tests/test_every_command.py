@@ -79,7 +79,7 @@ def test_a_real_drive(name: str, shared_data: Path, tmp_path: Path, command: Com
         "sensor": "HDL64",
         "sensor_height": 1.73,
         "label": {"starts": {"radius": 0.4, "step": 0.4}},
-        "observe": {"starts": 8, "range_max": 60.0},
+        "observe": {"starts": 8, "draws": 2, "worlds": 1, "range_max": 60.0},
         "model": {"recipe": "physics", "offset": 0.0},
     }
     config = tmp_path / "job.yaml"

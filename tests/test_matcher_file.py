@@ -345,7 +345,7 @@ def test_real_and_virtual_scans_go_through_the_same_steps(
         [route],
         tmp_path / "c",
         registration=RECIPE,
-        seeing=ts.VirtualSettings(starts=8),
+        seeing=ts.VirtualSettings(starts=8, draws=2, worlds=1),
     )
     assert (observed["status"] == "done").all()
     assert (observed["ob_points"] == 150).all()
@@ -400,7 +400,7 @@ def test_a_job_takes_the_folder(
         map={"sources": [str(inputs / "map_canyon.pcd")], "tile_size": 60.0},
         drives=[{"log": str(inputs / "canyon.mcap"), "until_s": 3.0}],
         routes=[str(tmp_path / "r.csv")],
-        observe={"starts": 8},
+        observe={"starts": 8, "draws": 2, "worlds": 1},
         label={"matcher": str(folder), "starts": {"radius": 0.2, "step": 0.2}},
         model={"recipe": "physics"},
     )

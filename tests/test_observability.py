@@ -41,7 +41,7 @@ from tilestream.settings import VirtualSettings
 from tilestream.store import POINTS, Tile
 
 SENSOR = ts.VLP16.model_copy(update={"name": "short", "range_max": 15.0, "azimuth_step_deg": 3.0})
-SEEING = VirtualSettings(starts=8)
+SEEING = VirtualSettings(starts=8, draws=2, worlds=1)
 PLACE = (20.0, 0.5, 2.0)
 
 
@@ -319,7 +319,7 @@ def test_bad_places_are_rows_that_say_so(store: ts.TileStore) -> None:
     assert "inside a wall" in table["reason"][3]
     assert table["vd_mean"][:4].isna().all()
     thin = SENSOR.model_copy(update={"azimuth_step_deg": 90.0})
-    short = VirtualSettings(starts=8, range_max=8.0)
+    short = VirtualSettings(starts=8, draws=2, worlds=1, range_max=8.0)
     few = look(store, [PLACE], [0.0], sensor=thin, seeing=short)
     assert few["status"].tolist() == ["failed"]
     assert "points" in few["reason"][0]
@@ -329,7 +329,7 @@ def test_bad_places_are_rows_that_say_so(store: ts.TileStore) -> None:
 def test_a_tile_that_failed_fails_those_who_see_it(street: Path, tmp_path: Path) -> None:
     store = ts.ingest(street, tmp_path / "map.zarr", tile_size=10.0)
     Tile(store, ts.TileKey(3, 0)).write_reason(POINTS, Mark("failed", "disk on fire"))
-    near = VirtualSettings(starts=8, range_max=8.0)
+    near = VirtualSettings(starts=8, draws=2, worlds=1, range_max=8.0)
     table = look(store, [[5.0, 0.5, 2.0], [28.0, 0.5, 2.0]], [0.0, 0.0], seeing=near)
     assert table["status"].tolist() == ["done", "failed"]
     assert "tile 3_0 is failed: disk on fire" in table["reason"][1]

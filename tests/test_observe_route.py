@@ -26,7 +26,7 @@ from tilestream.settings import VirtualSettings
 from tilestream.store import POINTS, Tile
 
 SENSOR = ts.VLP16.model_copy(update={"name": "short", "azimuth_step_deg": 3.0})
-SEEING = VirtualSettings(range_max=15.0, starts=8)
+SEEING = VirtualSettings(range_max=15.0, starts=8, draws=2, worlds=1)
 HOW = {"spacing": 6.0, "sensor": SENSOR, "seeing": SEEING}
 
 

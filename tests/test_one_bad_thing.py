@@ -211,7 +211,7 @@ def test_a_job_with_a_bad_drive_ends_with_one_and_says_which(
         map={"store": store.url},
         drives=[{"log": str(tmp_path / "empty.mcap")}, {"log": str(inputs / "canyon.mcap")}],
         routes=[str(tmp_path / "r.csv")],
-        observe={"starts": 8},
+        observe={"starts": 8, "draws": 2, "worlds": 1},
         label={"matcher": "default", "starts": {"radius": 0.2, "step": 0.2}},
         model={"recipe": "physics"},
     )
@@ -305,7 +305,7 @@ def test_a_project_that_moved_has_nothing_to_do_again(inputs: Path, tmp_path: Pa
             map={"sources": [str(folder / "*.pcd")], "tile_size": 50.0},
             drives=[{"log": str(folder / "canyon.mcap"), "until_s": 4.0}],
             routes=[str(folder / "r.csv")],
-            observe={"starts": 8},
+            observe={"starts": 8, "draws": 2, "worlds": 1},
             label={"matcher": "default", "starts": {"radius": 0.2, "step": 0.2}},
             model={"recipe": "physics"},
         )

@@ -169,7 +169,7 @@ def a_job_on(url: str, inputs: Path) -> RunSettings:
         out=url,
         map={"sources": [str(inputs / "map_canyon.pcd")], "tile_size": 50.0},
         routes=[str(inputs / "r.csv")],
-        observe={"starts": 8},
+        observe={"starts": 8, "draws": 2, "worlds": 1},
         model={"recipe": "physics"},
     )
 

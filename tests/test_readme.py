@@ -69,7 +69,7 @@ def test_the_city_block_runs(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     write_pcd(tmp_path / "map_canyon.pcd", street_of("canyon", 1, 0.3))
-    few: dict[str, object] = {"spacing": 12.0, "observe": {"starts": 16}}
+    few: dict[str, object] = {"spacing": 12.0, "observe": {"starts": 16, "draws": 2, "worlds": 1}}
     routes = [str(write_drive(tmp_path / "canyon.mcap", "canyon"))]
     physics = {"drives": [], "routes": routes, "model": {"recipe": "physics"}}
     own = job(tmp_path, tmp_path / "my-city", **few, **physics).model_dump(mode="json")

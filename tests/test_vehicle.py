@@ -109,7 +109,9 @@ def test_a_vehicle_of_two_half_views_is_observed_as_one_whole_view(tmp_path: Pat
     write_pcd(tmp_path / "a.pcd", PLACES["canyon"](np.random.default_rng(3), 30.0, 0.3))
     store = ts.ingest(tmp_path / "a.pcd", tmp_path / "map.zarr", tile_size=20.0)
     one, two = (
-        observability(store, [[12.0, 0.5, 2.0]], [0.1], vehicle, VirtualSettings(starts=8))
+        observability(
+            store, [[12.0, 0.5, 2.0]], [0.1], vehicle, VirtualSettings(starts=8, draws=2, worlds=1)
+        )
         for vehicle in (EXACT, halves())
     )
     assert one["status"].tolist() == two["status"].tolist() == ["done"]
