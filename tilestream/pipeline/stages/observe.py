@@ -53,9 +53,9 @@ class Observing:
 
 @stage(
     "observe",
-    version=4,
+    version=5,
     memory=lambda counts: FIXED_BYTES + BYTES_PER_POINT * counts["points"],
-    seconds=0.18,
+    seconds=0.27,
     columns=(*PLACE_COLUMNS, *COLUMNS, *STATUS_COLUMNS),
 )
 def observe(map_part: MapPart, samples: Samples, observing: Observing) -> Made:

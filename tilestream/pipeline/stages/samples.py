@@ -12,6 +12,7 @@ from tilestream.errors import DamagedError, SourceNotFoundError
 from tilestream.factors import catalogue, observability
 from tilestream.factors.along_route import AVERAGED, averaged_along
 from tilestream.factors.rows import PLACE_COLUMNS, STATUS_COLUMNS
+from tilestream.factors.virtual_drive import MOMENT_COLUMNS
 from tilestream.marks import Mark
 from tilestream.model.dataset import VIRTUAL_DRIVES, Dataset
 from tilestream.model.features import features_of
@@ -188,7 +189,8 @@ def places_with_factors(
 ) -> pd.DataFrame:
     """Every sample point of the factor tables with all its factors.
 
-    A place that has the factors and could not be observed has NaN there, and says why.
+    A place that has the factors and could not be observed has NaN there, and says why. The moments
+    of the virtual drive stay in the tables of observability.
 
     Args:
         factors: tables of factors.
@@ -200,7 +202,8 @@ def places_with_factors(
         return places
     seen = averaged_along(_rows(observed), width)
     keys = ["route_id", "sample"]
-    names = [column.name for column in observability.COLUMNS if column.name in seen]
+    kept = (column.name for column in observability.COLUMNS if column not in MOMENT_COLUMNS)
+    names = [name for name in kept if name in seen]
     seen = seen[[*keys, *names, "status", "reason"]]
     seen = seen.rename(columns={"status": "seen", "reason": "why"})
     joined = places.merge(seen, on=keys, how="left", validate="one_to_one")
