@@ -60,6 +60,7 @@ from tilestream.factors.observability import (
 from tilestream.factors.surfels import surfel_mm, surfels_in, tile_surfels
 from tilestream.factors.virtual_drive import ends_of, stratified_starts, virtual_drive
 from tilestream.factors.virtual_scan import Beams, Scene, look, scan_in_world, virtual_scan
+from tilestream.factors.worlds import passed_by
 from tilestream.formats.logs import open_log
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.formats.routes import route_of
@@ -135,9 +136,9 @@ def cost(folder: Path, spacing: float) -> pd.DataFrame:
         ("surfels of a tile", f"{points:,} points", cpu_ms(lambda: tile_surfels(store, key), 2)),
         ("scene, per sample point", "25 share one", cpu_ms(scene, 3) / 25),
         (
-            "the same without foliage",
-            "25 share one",
-            cpu_ms(lambda: made.without_foliage(0, 3), 3) / 25,
+            "balls passed by in a draw",
+            "25 share them",
+            cpu_ms(lambda: passed_by(surfels.centre_mm, ~surfels.flat, 0, 3), 3) / 25,
         ),
         (
             "beams cast",

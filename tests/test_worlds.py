@@ -8,7 +8,7 @@ from test_virtual_scan import FEW, scene_of, sheet
 
 import tilestream as ts
 from tilestream.factors.virtual_scan import Beams, look, scan_in_world, virtual_scan
-from tilestream.factors.worlds import Dice, World, foliage_gone, kept, stopped, world_at
+from tilestream.factors.worlds import Dice, World, kept, passed_by, stopped, world_at
 from tilestream.kernels.boxes import stopped_by
 from tilestream.settings import VirtualSettings
 
@@ -101,15 +101,15 @@ def test_returns_are_lost_with_range_and_grazing_incidence() -> None:
     assert share(np.inf, 0.0) == 0.0
 
 
-def test_a_part_of_what_is_not_flat_has_gone_wherever_it_is_looked_from() -> None:
+def test_a_part_of_what_is_not_flat_is_passed_by_wherever_it_is_looked_from() -> None:
     rng = np.random.default_rng(0)
     centre, ball = rng.integers(-50_000, 50_000, (5000, 3)), rng.uniform(size=5000) < 0.6
-    gone = foliage_gone(centre, ball, 0, 3)
+    gone = passed_by(centre, ball, 0, 3)
     assert not gone[~ball].any()
     assert gone[ball].mean() == pytest.approx(0.4, abs=0.03)
     order = rng.permutation(5000)[:3000]
-    np.testing.assert_array_equal(foliage_gone(centre[order], ball[order], 0, 3), gone[order])
-    assert (foliage_gone(centre, ball, 0, 4) != gone).any()
+    np.testing.assert_array_equal(passed_by(centre[order], ball[order], 0, 3), gone[order])
+    assert (passed_by(centre, ball, 0, 4) != gone).any()
 
 
 def test_a_scan_in_a_world_is_of_the_map_and_of_those_in_the_street() -> None:

@@ -21,7 +21,6 @@ from tilestream.factors.virtual_drive import COLUMNS as DRIVE_COLUMNS
 from tilestream.factors.virtual_drive import Ends, ends_of, stratified_starts, virtual_drive
 from tilestream.factors.virtual_scan import (
     Beams,
-    Returns,
     Scene,
     VirtualScan,
     look,
@@ -29,6 +28,7 @@ from tilestream.factors.virtual_scan import (
     scan_in_world,
     virtual_scan,
 )
+from tilestream.factors.worlds import passed_by
 from tilestream.formats.logs.poses import transform
 from tilestream.grid import MM_PER_M, Box
 from tilestream.kernels.cells import cell_of_points, cell_sums
@@ -195,14 +195,16 @@ class _View:
         self, surfels: Surfels, ghosts: Surfels, cells: Cells, places: Float64
     ) -> "_Block | None":
         """What places near one another share; None: nothing is in view."""
-        scene = self.scene(surfels, places)
-        if scene is None:
+        near, passed = (self.in_view(those, places) for those in (surfels, ghosts))
+        if not len(near):
             return None
-        seed, still = self.seeing.seed, self.seeing.draws - self.seeing.worlds
+        scene = self.scene(near, places)
+        balls, seed = ~near.flat, self.seeing.seed
+        gone = (passed_by(near.centre_mm, balls, seed, k) for k in range(self.seeing.draws))
         return _Block(
             scene,
-            self.scene(ghosts, places),
-            tuple(scene.without_foliage(seed, k) for k in range(still, self.seeing.draws)),
+            tuple(scene.without(some) for some in gone),
+            self.scene(passed, places) if len(passed) else None,
             self.listed(cells, places),
         )
 
@@ -214,11 +216,10 @@ class _View:
         except RegistrationError:
             return cells  # of which each place says so itself
 
-    def scene(self, surfels: Surfels, places: Float64) -> Scene | None:
-        """The scene that places near one another share; None: nothing is in view."""
-        near = self.in_view(surfels, places)
+    def scene(self, near: Surfels, places: Float64) -> Scene:
+        """The scene that places near one another share, of the surfels that are in view."""
         stands = whole_places(np.concatenate([places - self.beams.rim, places + self.beams.rim]))
-        return Scene.of(near, stands, surfel_mm(self.store)) if len(near) else None
+        return Scene.of(near, stands, surfel_mm(self.store))
 
     def in_view(self, surfels: Surfels, places: Float64) -> Surfels:
         """The surfels that a beam from any of the places can meet, and a few more."""
@@ -228,13 +229,14 @@ class _View:
         """The row of a place; columns that are not known there are left out."""
         if around is None:
             return {"status": "missing", "reason": NOTHING.format(0, len(self.beams))}
-        scene, place_mm = around.scene, whole_places(place)
-        walled = near_share(scene, place_mm, self.beams, self.seeing.range_min)
+        place_mm = whole_places(place)
+        walled = near_share(around.scene, place_mm, self.beams, self.seeing.range_min)
         if walled > INSIDE:
             reason = WALLED.format(walled, self.seeing.range_min)
             return {"status": "failed", "reason": reason}
-        found = look(scene, place_mm, heading, self.seeing, self.beams)
-        scan = virtual_scan(scene, found, place_mm, self.seeing, self.beams)
+        first = around.drawn[0]
+        found = look(first, place_mm, heading, self.seeing, self.beams)
+        scan = virtual_scan(first, found, place_mm, self.seeing, self.beams)
         view: Row = {
             "ob_returns": scan.return_share,
             "ob_unmapped": scan.unmapped_share,
@@ -246,7 +248,7 @@ class _View:
         T_map_lidar = np.eye(4)
         T_map_lidar[:2, :2] = _turn(heading)
         T_map_lidar[:3, 3] = place_mm / MM_PER_M
-        scans = self.scans(around, found, place_mm, heading)
+        scans = self.scans(around.drawn, place_mm, heading)
         try:
             held = hessian_factors(around.cells, scan.points, T_map_lidar, self.registration)
             drives = self.drives(around.cells, scans, T_map_lidar)
@@ -254,19 +256,17 @@ class _View:
             return {**view, "status": "failed", "reason": str(error)}
         return {**view, **held, **virtual_drive(drives), "status": "done", "reason": ""}
 
-    def scans(
-        self, around: "_Block", found: tuple[Returns, ...], place_mm: Int64, heading: float
-    ) -> Iterator[Float64]:
+    def scans(self, drawn: tuple[Scene, ...], place_mm: Int64, heading: float) -> Iterator[Float64]:
         """The points of each draw, in the lidar frame: of the street as it was mapped, then of
         others.
         """
         seeing, beams = self.seeing, self.beams
-        still = seeing.draws - seeing.worlds
-        for draw in range(still):
-            yield virtual_scan(around.scene, found, place_mm, seeing, beams, draw).points
-        for draw, scene in enumerate(around.worlds, start=still):
-            met = look(scene, place_mm, heading, seeing, beams)
-            yield scan_in_world(met, place_mm, seeing, beams, draw)
+        for draw, scene in enumerate(drawn):
+            found = look(scene, place_mm, heading, seeing, beams)
+            if draw < seeing.draws - seeing.worlds:
+                yield virtual_scan(scene, found, place_mm, seeing, beams, draw).points
+            else:
+                yield scan_in_world(found, place_mm, seeing, beams, draw)
 
     def drives(
         self, cells: Cells | LocalCells, scans: Iterator[Float64], T_map_lidar: Float64
@@ -303,10 +303,10 @@ class _Block:
 
     scene: Scene
     """What is in view."""
+    drawn: tuple[Scene, ...]
+    """The same of each draw: without the balls that its beams pass by."""
     ghosts: Scene | None
     """The ghosts that would be."""
-    worlds: tuple[Scene, ...]
-    """What is in view in streets that are not as they were mapped, draw by draw."""
     cells: Cells | LocalCells
     """The cells around."""
 

@@ -8,14 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tilestream.factors.surfels import Surfels
-from tilestream.factors.worlds import Dice, foliage_gone, kept, stopped, world_at
+from tilestream.factors.worlds import Dice, kept, stopped, world_at
 from tilestream.grid import MM_PER_M
 from tilestream.kernels.fixed_order import turned
 from tilestream.kernels.surfels import NORMAL_ONE
 from tilestream.kernels.virtual_scan import (
     BRICK,
     FREE,
-    RADIUS,
     VOXELS,
     Bricks,
     bound_bricks,
@@ -45,8 +44,6 @@ class Scene:
     """(nx, ny) columns of 10 m that hold any of the map."""
     mapped_corner: Int64
     """(2,) their lowest corner [mm, map frame]."""
-    surfels: Surfels
-    """What is indexed."""
 
     @classmethod
     def of(cls, surfels: Surfels, places_mm: Int64, edge_mm: int) -> "Scene":
@@ -74,15 +71,13 @@ class Scene:
         mapped = np.zeros(tuple(column.max(axis=0) - mapped_low + 1), np.bool_)
         mapped[tuple((column - mapped_low).T)] = True
         bounds = bound_bricks(edge_mm, grid, voxels)
-        bricks = Bricks(edge_mm, corner, grid, voxels, bounds, table)
-        return cls(bricks, mapped, mapped_low * COLUMN_MM, surfels)
+        none = np.zeros(len(surfels), np.bool_)
+        bricks = Bricks(edge_mm, corner, grid, voxels, bounds, table, none)
+        return cls(bricks, mapped, mapped_low * COLUMN_MM)
 
-    def without_foliage(self, seed: int, draw: int) -> "Scene":
-        """The same scene without a part of what is not flat (`foliage_gone`)."""
-        gone = foliage_gone(self.surfels.centre_mm, ~self.surfels.flat, seed, draw)
-        table = self.bricks.surfels.copy()
-        table[gone, RADIUS] = 0.0  # no beam meets a ball without a radius
-        return replace(self, bricks=self.bricks._replace(surfels=table))
+    def without(self, gone: NDArray[np.bool_]) -> "Scene":
+        """The same scene, some of its surfels (n,) left out."""
+        return replace(self, bricks=self.bricks._replace(gone=gone))
 
 
 @dataclass(frozen=True, eq=False)

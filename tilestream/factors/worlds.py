@@ -1,9 +1,8 @@
 """Streets that are not as they were mapped: what some of the virtual scans are cast in
 (definitions, section 4.3).
 
-Cars are parked and driving, people walk, foliage has gone, the vehicle moves during a turn, each
-beam has a bias, and returns are lost. None of it is fitted to anything, least of all to the
-simulation.
+Cars are parked and driving, people walk, the vehicle moves during a turn, each beam has a bias, and
+returns are lost. None of it is fitted to anything, least of all to the simulation.
 """
 
 from dataclasses import dataclass
@@ -25,8 +24,8 @@ TRUCKS = 0.15
 """Share of the cars that are as large as a truck."""
 PERSON = (0.5, 0.5, 1.7)
 """Length, width and height [m]."""
-GONE = 0.4
-"""Share of the foliage that is gone."""
+PASSED_BY = 0.4
+"""Share of the balls that no beam meets: foliage, fences and the like are half transparent."""
 BIAS = 0.01
 """Standard deviation of the bias of a beam [m]."""
 SLIP = 0.5
@@ -137,11 +136,9 @@ def _driving(dice: Dice, beside: float, gap: float) -> Float64:
     return apart
 
 
-def foliage_gone(
-    centre_mm: Int64, ball: NDArray[np.bool_], seed: int, draw: int
-) -> NDArray[np.bool_]:
-    """(n,) which surfels are missing in a draw: a share of those that are not flat, each decided by
-    where it is.
+def passed_by(centre_mm: Int64, ball: NDArray[np.bool_], seed: int, draw: int) -> NDArray[np.bool_]:
+    """(n,) which surfels the beams of a draw pass by: a share of those that are not flat, each
+    decided by where it is.
 
     Args:
         centre_mm: (n, 3) centres [mm, map frame].
@@ -149,13 +146,14 @@ def foliage_gone(
         seed: of the job.
         draw: number of the draw.
     """
-    gone = np.zeros(len(ball), np.bool_)
+    passed = np.zeros(len(ball), np.bool_)
     state = np.full(int(ball.sum()), seed, np.uint64)
     draws = np.full(len(state), draw, np.uint64)
     for numbers in (draws, *centre_mm[ball].T.astype(np.int64).view(np.uint64)):
         state = mixed(state + GOLDEN) ^ numbers
-    gone[ball] = (mixed(state + GOLDEN) >> np.uint64(11)).astype(np.float64) * 2.0**-53 < GONE
-    return gone
+    share = (mixed(state + GOLDEN) >> np.uint64(11)).astype(np.float64) * 2.0**-53
+    passed[ball] = share < PASSED_BY
+    return passed
 
 
 def stopped(

@@ -52,6 +52,8 @@ class Bricks(NamedTuple):
     """(bricks, 6) box of the voxels that are not free, lowest and highest [mm from the corner]."""
     surfels: Float32
     """(n, 8) surfels, columns `X` to `RADIUS`."""
+    gone: NDArray[np.bool_]
+    """(n,) surfels that no beam meets."""
 
 
 @njit(nogil=True, error_model="numpy")
@@ -200,7 +202,7 @@ def _slab(low, high, position, inverse, t, t_out):  # type: ignore[no-untyped-de
 
 
 @njit(nogil=True, error_model="numpy", boundscheck=False)
-def _through_brick(voxels, surfels, edge, brick, start, p, d, t, t_out, near, best):  # type: ignore[no-untyped-def]
+def _through_brick(voxels, surfels, gone, edge, brick, start, p, d, t, t_out, near, best):  # type: ignore[no-untyped-def]
     """The first surfel met in a brick between t and t_out, if nearer than `best` [mm].
 
     `brick` and `start` count from the brick in which the ray starts, `p` from the grid's corner:
@@ -223,7 +225,7 @@ def _through_brick(voxels, surfels, edge, brick, start, p, d, t, t_out, near, be
     while t <= t_out and t < best:
         s = voxels[(u * BRICK + v) * BRICK + w]
         leaves = min(tu, tv, tw)
-        if s != FREE:
+        if s != FREE and not gone[np.uint64(s)]:
             surfel = surfels[np.uint64(s)]
             met, miss, its_cosine = _meet(surfel, px, py, pz, dx, dy, dz)
             solid = t - ROUNDING <= met <= leaves + ROUNDING and miss < np.inf
@@ -302,6 +304,7 @@ def cast(
                     met, its_cosine = _through_brick(
                         voxels[np.uint64(b)],
                         surfels,
+                        bricks.gone,
                         edge,
                         (i, j, k),
                         (fx, fy, fz),

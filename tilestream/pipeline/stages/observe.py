@@ -18,10 +18,10 @@ from tilestream.settings import VirtualSettings
 FIXED_BYTES = 600_000_000
 """Memory of the task besides what it reads: a scene, the registrations, and the terms that factors
 tasks keep in the same process."""
-BYTES_PER_POINT = 70
+BYTES_PER_POINT = 65
 """Memory per map point in sight: its surfels and cells, those in view of a place once more …"""
-BYTES_PER_WORLD = 35
-"""… and again for each street that is not as it was mapped."""
+BYTES_PER_DRAW = 1
+"""… and which of them the beams of each draw pass by."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Observing:
     "observe",
     version=5,
     memory=lambda counts: (
-        FIXED_BYTES + (BYTES_PER_POINT + BYTES_PER_WORLD * counts["worlds"]) * counts["points"]
+        FIXED_BYTES + (BYTES_PER_POINT + BYTES_PER_DRAW * counts["draws"]) * counts["points"]
     ),
     seconds=0.27,
     columns=(*PLACE_COLUMNS, *COLUMNS, *STATUS_COLUMNS),
@@ -122,6 +122,6 @@ def observe_task(
         takes={"samples": samples, "observing": observing},
         reads={"map_part": plan.part(seen, made)},
         work=len(samples),
-        counts={"points": plan.count(seen), "worlds": observing.seeing.worlds},
+        counts={"points": plan.count(seen), "draws": observing.seeing.draws},
         tile=tile,
     )
