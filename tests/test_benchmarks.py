@@ -24,6 +24,7 @@ SCRIPTS = sorted(path.name for path in FOLDER.glob("*.py") if "__main__" in path
 DOCUMENTS = (FOLDER / "RESULTS.md", ROOT / "pipelines" / "README.md")
 SMALLEST = (
     "drive.py canyon.mcap --figures figures",
+    "drives.py canyon.mcap --out runs --sensor VLP16 --height 2 --range 14 --set starts=16",
     "encryption.py --rounds 1 --turns 1 --tasks 10 --tiles 1",
     "factors.py --tiles 1 --literal 1 --shifts 1 --spacing 0.5",
     "figures.py --spacing 1.0 --figures figures",
