@@ -133,11 +133,16 @@ def measured(given: argparse.Namespace) -> tuple[pd.DataFrame, pd.DataFrame]:
         lost.append(found.lost.assign(street=street_of(log)))
     table = pd.concat(tables).rename(columns={"group": "lidar"})
     table = table.sort_values(["street", "lidar", "arc_length"], kind="stable", ignore_index=True)
-    begin = table.groupby("street")["arc_length"].transform("min")
-    length = table.groupby("street")["arc_length"].transform("max") - begin
+    return table.assign(block=blocks(table, "street")), pd.concat(lost)
+
+
+def blocks(table: pd.DataFrame, street: str) -> pd.Series:
+    """Name of the block of each place: equal pieces of about `BLOCK` of the streets in a column."""
+    arc = table.groupby(street)["arc_length"]
+    begin, length = arc.transform("min"), arc.transform("max") - arc.transform("min")
     pieces = np.maximum(np.rint(length / BLOCK), 1)
     piece = np.minimum((table["arc_length"] - begin) / length.clip(lower=1.0) * pieces, pieces - 1)
-    return table.assign(block=table["street"] + piece.astype(int).astype(str)), pd.concat(lost)
+    return table[street] + piece.astype(int).astype(str)
 
 
 # --- Figures, with their bootstrap
@@ -156,14 +161,8 @@ def figure(table: pd.DataFrame, rows: Rows, value: Callable[[Rows], float]) -> F
     ]
     drawn = [one for one in drawn if np.isfinite(one)] or [np.nan]
     low, high = np.quantile(drawn, (0.05, 0.95))
-    return {
-        "value": value(rows),
-        "low": float(low),
-        "high": float(high),
-        "standard_error": float(np.std(drawn)),
-        "places": len(rows),
-        "blocks": len(parts),
-    }
+    found = {"value": value(rows), "low": float(low), "high": float(high)}
+    return found | {"standard_error": float(np.std(drawn)), "places": len(rows)}
 
 
 def spearman(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
@@ -318,12 +317,11 @@ def figures(table: pd.DataFrame, lost: pd.DataFrame, model: Path | None) -> dict
 # --- In words
 
 
-def told(one: Figure, digits: int = 2) -> str:
+def told(one: Figure) -> str:
     """A figure with its bootstrap."""
     if not np.isfinite(one["value"]):
         return "-"
-    value, low, high = (f"{one[name]:.{digits}f}" for name in ("value", "low", "high"))
-    return f"{value} ({low} to {high})"
+    return "{value:.2f} ({low:.2f} to {high:.2f})".format(**one)
 
 
 def show(title: str, names: str, rows: list[tuple[str, ...]]) -> None:
@@ -337,9 +335,8 @@ def level_told(part: str, one: Figure) -> str:
     if not np.isfinite(one["measured"]):
         return "-"
     scale, digits = (1.0, 3) if part == "p_fail" else (CM, 1)
-    both = [f"{scale * one[name]:.{digits}f}" for name in ("measured", "estimated")]
-    ratio = "" if not np.isfinite(one["value"]) else f": {one['value']:.2f}"
-    return f"{both[0]} / {both[1]}{ratio}"
+    both = (f"{scale * one[name]:.{digits}f}" for name in ("measured", "estimated"))
+    return " / ".join(both) + (f": {one['value']:.2f}" if np.isfinite(one["value"]) else "")
 
 
 def tell(found: dict[str, Any]) -> None:
