@@ -30,6 +30,7 @@ SMALLEST = (
     "figures.py --spacing 1.0 --figures figures",
     "figures_simulation.py --figures figures",
     "ingest.py --points 0.01 --repeats 1",
+    "one_way.py --out one-way --paths IV --metres 20 --rays 500",
     "power_loss.py --points 300",
     "predict.py --rows 10 --share 0.05",
     "raycast.py --metres 1 --rounds 1",
