@@ -24,11 +24,13 @@ SCRIPTS = sorted(path.name for path in FOLDER.glob("*.py") if "__main__" in path
 DOCUMENTS = (FOLDER / "RESULTS.md", ROOT / "pipelines" / "README.md")
 SMALLEST = (
     "drive.py canyon.mcap --figures figures",
+    "drives.py canyon.mcap --out runs --sensor VLP16 --height 2 --range 14 --set starts=16",
     "encryption.py --rounds 1 --turns 1 --tasks 10 --tiles 1",
     "factors.py --tiles 1 --literal 1 --shifts 1 --spacing 0.5",
     "figures.py --spacing 1.0 --figures figures",
     "figures_simulation.py --figures figures",
     "ingest.py --points 0.01 --repeats 1",
+    "one_way.py --out one-way --paths IV --metres 20 --rays 500",
     "power_loss.py --points 300",
     "predict.py --rows 10 --share 0.05",
     "raycast.py --metres 1 --rounds 1",

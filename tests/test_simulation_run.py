@@ -20,8 +20,9 @@ import tilestream as ts
 from tilestream.cli import run
 from tilestream.errors import PlanError, UsageError
 from tilestream.formats.logs import ScanSelection, open_log
+from tilestream.formats.logs.poses import transform
 from tilestream.pipeline.engine.stage import BASE_BYTES
-from tilestream.pipeline.jobs.simulate import plan_simulation, simulate
+from tilestream.pipeline.jobs.simulate import Size, plan_simulation, simulate
 from tilestream.pipeline.stages import simulated
 from tilestream.records import Scan
 from tilestream.settings import LogOptions, StartSettings
@@ -411,6 +412,30 @@ def test_readers_take_the_true_poses_and_not_the_odometry(made: Path, city: City
     gap = np.linalg.norm(believed.T_map_lidar[:, :2, 3] - true[:, :2, 3], axis=1)
     assert 0.5 * city.settings.odometry_error < np.sqrt((gap**2).mean())
     assert np.sqrt((gap**2).mean()) < 2.0 * city.settings.odometry_error
+
+
+@pytest.mark.parametrize(("size", "end"), [("full", A), ("small", 40)])
+def test_a_drive_back_passes_the_same_places_on_its_right(
+    settings: SimulationSettings, tmp_path: Path, size: Size, end: int
+) -> None:
+    back = changed(settings, "survey", passes=1).model_copy(update={"reverse": True, "side": 1.0})
+    made = simulate(back, tmp_path / "back", paths=["A"], size=size)
+    assert {path.stem[:4] for path in (made / "survey").iterdir()} == {"A_0_"}  # one way only
+    log = open_log(made / "logs" / "drive0" / "A.mcap")
+    places = log.T_map_lidar[:, :3, 3]
+    np.testing.assert_allclose(places[:, 0], 20.0 + np.arange(end)[::-1], atol=1e-6)
+    np.testing.assert_allclose(places[:, 1], 7.0, atol=1e-6)  # the street is at 6 m, along x
+    np.testing.assert_allclose(log.T_map_lidar[:, 0, 0], -1.0, atol=1e-3)
+    scan = next(iter(log.scans_at([end // 2])))
+    assert scan.T_map_lidar is not None
+    points = transform(scan.T_map_lidar, scan.points)
+    for wall, inwards in ((0.0, -1.0), (14.0, 1.0)):
+        deep = (points[:, 1] - wall) * inwards
+        near = deep[np.abs(deep) < 1.0]
+        assert len(near) > 500
+        assert 0.0 < np.median(near) < settings.city.relief
+    route, ahead = ts.read_routes(made / "routes.geojson")[0].positions, np.arange(end)
+    np.testing.assert_allclose(route[:, :2], np.column_stack([20.0 + ahead, 6.0 + 0 * ahead]))
 
 
 def test_the_command_makes_what_is_ingested_and_localized(

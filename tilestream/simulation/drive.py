@@ -36,6 +36,8 @@ class Motion:
     """(n,) speed at each sample point [m/s]."""
     time: Float64
     """(n,) when it passes each sample point [s after the drive begins]."""
+    side: float = 0.0
+    """How far right of the street's route it keeps [m]."""
 
     def arc_at(self, time: Float64) -> Float64:
         """(k,) arc length at times [m]; before and after the drive the end speed goes on."""
@@ -55,6 +57,7 @@ class Motion:
         y = np.column_stack([-ahead[:, 1], ahead[:, 0], np.zeros(len(xy))])
         T = np.tile(np.eye(4), (len(xy), 1, 1))
         T[:, :3, :3] = np.stack([x, y, np.cross(x, y)], axis=2)
+        xy = xy + self.side * np.column_stack([ahead[:, 1], -ahead[:, 0]])
         T[:, :2, 3] = xy
         T[:, 2, 3] = road(ground, xy) + self.height
         return T
@@ -66,6 +69,11 @@ def road(ground: Ground, xy: Float64) -> Float64:
     return np.asarray(ground.at(around.reshape(-1, 2)).reshape(len(xy), -1).mean(axis=1))
 
 
+def driven_way(street: Street, settings: SimulationSettings) -> Street:
+    """A street from where the drive begins."""
+    return street.back() if settings.reverse else street
+
+
 def motion_of(street: Street, settings: SimulationSettings, height: float) -> Motion:
     """A drive whose speed varies smoothly between 65 % and 100 % of the largest."""
     rng = stream(settings.seed, "speed", settings.drive, street.number)
@@ -73,7 +81,8 @@ def motion_of(street: Street, settings: SimulationSettings, height: float) -> Mo
     wave = np.sin(street.arc[:, None] * 2 * np.pi / length + phase).mean(axis=1)
     speed = settings.lidar.speed * (0.825 + 0.175 * wave)
     between = 2.0 / (speed[:-1] + speed[1:])
-    return Motion(street, height, speed, np.concatenate([[0.0], np.cumsum(between)]))
+    time = np.concatenate([[0.0], np.cumsum(between)])
+    return Motion(street, height, speed, time, settings.side)
 
 
 def stamps_of(motion: Motion, settings: SimulationSettings, scans_per_point: int) -> Int64:
@@ -91,7 +100,7 @@ def scans(
 
     Args:
         city: the city, with the settings of the drive.
-        street: the street.
+        street: the street as it is driven (`driven_way`).
         points: the first sample point and the one after the last.
         scans_per_point: turns kept per sample point.
     """

@@ -95,7 +95,7 @@ class SurveySettings(Settings):
     noise: Length = 0.015
     """Standard deviation of a range [m]."""
     passes: Annotated[int, Field(gt=0, le=4)] = 2
-    """How many times each street is driven."""
+    """How many times each street is driven: 1 is one way only; every second pass drives back."""
     drift: Length = 0.02
     """Root mean square of the position error of a pass, smooth over 50 to 200 m [m]."""
     traffic: Share = 0.3
@@ -134,6 +134,10 @@ class SimulationSettings(Settings):
     """Root mean square of the smooth error of the logged odometry [m]."""
     seed: int = 0
     """Seed of everything."""
+    reverse: bool = False
+    """Whether the drive goes along the streets the other way, from their ends."""
+    side: Annotated[float, Field(ge=0.0, le=2.0)] = 0.0
+    """How far right of the route the drive keeps [m]."""
     drive: Annotated[int, Field(ge=0)] = 0
     """Which drive: another number is another day, with other traffic, noise, leaves and cars."""
 

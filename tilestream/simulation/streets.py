@@ -4,7 +4,7 @@ import itertools
 import json
 import os
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +78,12 @@ class Street:
         arc = np.asarray(arc, np.float64)
         step = self.at(arc + 1.0) - self.at(arc - 1.0)
         return np.arctan2(step[:, 1], step[:, 0])
+
+    def back(self) -> "Street":
+        """The street from its end to its beginning; without its spots, which are told by arc length
+        from the other end.
+        """
+        return replace(self, xy=self.xy[::-1], spots=())
 
     def spots_of(self, *kinds: str) -> tuple[Spot, ...]:
         """Its stretches of these kinds."""

@@ -4,6 +4,7 @@ import hashlib
 import json
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -175,6 +176,9 @@ def _drive(
     if not street.driven or path.exists():
         return []
     takes = {"street": street.name, "scans_per_point": scans_per_point}
+    if settings.reverse:
+        last = len(street.xy)
+        pieces = [(last - end, last - begin) for begin, end in reversed(pieces)]
     parts = [
         Task(
             scan,
@@ -189,14 +193,14 @@ def _drive(
         )
         for begin, end in pieces
     ]
-    end = pieces[-1][1]
+    stretch = pieces[0][0], pieces[-1][1]
     log_task = Task(
         log,
         street.name,
         DriveLog(str(path)),
-        takes={**takes, "end": end},
+        takes={**takes, "stretch": stretch},
         reads={"city": city, "parts": tuple(part.product for part in parts)},
-        work=end,
+        work=stretch[1] - stretch[0],
     )
     return [*parts, log_task]
 
@@ -293,7 +297,7 @@ def _keep(path: Path, text: str) -> None:
 
 def _feature(street: Street, city: City, end: int | None) -> dict[str, Any]:
     """A street as GeoJSON, as far as it is simulated, with the height of its road."""
-    motion = motion_of(street, city.settings, 0.0)
+    motion = replace(motion_of(street, city.settings, 0.0), side=0.0)
     line = motion.pose(city.ground, street.arc[:end])[:, :3, 3]
     properties = {
         "name": street.name,

@@ -16,7 +16,7 @@ from tilestream.pipeline.engine.outputs import Facts, Made
 from tilestream.pipeline.engine.stage import Counts, stage
 from tilestream.records import Column, Scan, Trajectory
 from tilestream.simulation.city import City, build_city
-from tilestream.simulation.drive import motion_of, odometry, stamps_of
+from tilestream.simulation.drive import driven_way, motion_of, odometry, stamps_of
 from tilestream.simulation.drive import scans as scans_of
 from tilestream.simulation.settings import SimulationSettings
 from tilestream.simulation.survey import survey as survey_of
@@ -137,20 +137,26 @@ def survey(city: City, street: str, stretch: tuple[int, int], passes: int) -> An
 
 @stage("scan", version=1, memory=lambda _: SCENE_BYTES, seconds=0.03)
 def scan(city: City, street: str, stretch: tuple[int, int], scans_per_point: int) -> Iterable[Scan]:
-    """The scans of a drive along a stretch."""
-    return scans_of(city, city.street(street), stretch, scans_per_point)
+    """The scans of a drive along a stretch of a street, from where it begins."""
+    way = driven_way(city.street(street), city.settings)
+    return scans_of(city, way, stretch, scans_per_point)
 
 
 @stage("log", version=2, memory=lambda _: SCENE_BYTES, seconds=0.02)
 def log(
-    city: City, parts: Sequence[Iterator[Scan]], street: str, end: int, scans_per_point: int
+    city: City,
+    parts: Sequence[Iterator[Scan]],
+    street: str,
+    stretch: tuple[int, int],
+    scans_per_point: int,
 ) -> Made:
-    """All scans of a drive along a street up to a sample point, its odometry and its truth."""
-    driven, settings = city.street(street), city.settings
+    """All scans of a drive along a stretch of a street, its odometry and its truth."""
+    settings = city.settings
+    driven = driven_way(city.street(street), settings)
     motion = motion_of(driven, settings, settings.lidar.height)
     stamps = stamps_of(motion, settings, scans_per_point)
     origin = round(stamps[0].mean())
-    seen = stamps[:end].ravel()
+    seen = stamps[slice(*stretch)].ravel()
     every = np.arange(seen[0], seen[-1] + 2 * POSE_NS, POSE_NS)
     # The truth also has a pose at each scan and half-way: more than the odometry, so readers that
     # are told no topic take it.
