@@ -21,6 +21,7 @@ from tilestream.factors.virtual_drive import COLUMNS as DRIVE_COLUMNS
 from tilestream.factors.virtual_drive import Ends, ends_of, stratified_starts, virtual_drive
 from tilestream.factors.virtual_scan import (
     Beams,
+    Returns,
     Scene,
     VirtualScan,
     look,
@@ -199,11 +200,15 @@ class _View:
         if not len(near):
             return None
         scene = self.scene(near, places)
-        balls, seed = ~near.flat, self.seeing.seed
-        gone = (passed_by(near.centre_mm, balls, seed, k) for k in range(self.seeing.draws))
+        balls, seed, draws = ~near.flat, self.seeing.seed, self.seeing.draws
+        first, *others = (
+            scene.without(passed_by(near.centre_mm, balls, seed, draw))
+            for draw in (0, *range(draws - self.seeing.worlds, draws))
+        )
         return _Block(
             scene,
-            tuple(scene.without(some) for some in gone),
+            first,
+            tuple(others),
             self.scene(passed, places) if len(passed) else None,
             self.listed(cells, places),
         )
@@ -234,9 +239,8 @@ class _View:
         if walled > INSIDE:
             reason = WALLED.format(walled, self.seeing.range_min)
             return {"status": "failed", "reason": reason}
-        first = around.drawn[0]
-        found = look(first, place_mm, heading, self.seeing, self.beams)
-        scan = virtual_scan(first, found, place_mm, self.seeing, self.beams)
+        found = look(around.mapped, place_mm, heading, self.seeing, self.beams)
+        scan = virtual_scan(around.mapped, found, place_mm, self.seeing, self.beams)
         view: Row = {
             "ob_returns": scan.return_share,
             "ob_unmapped": scan.unmapped_share,
@@ -248,7 +252,7 @@ class _View:
         T_map_lidar = np.eye(4)
         T_map_lidar[:2, :2] = _turn(heading)
         T_map_lidar[:3, 3] = place_mm / MM_PER_M
-        scans = self.scans(around.drawn, place_mm, heading)
+        scans = self.scans(around, found, place_mm, heading)
         try:
             held = hessian_factors(around.cells, scan.points, T_map_lidar, self.registration)
             drives = self.drives(around.cells, scans, T_map_lidar)
@@ -256,17 +260,19 @@ class _View:
             return {**view, "status": "failed", "reason": str(error)}
         return {**view, **held, **virtual_drive(drives), "status": "done", "reason": ""}
 
-    def scans(self, drawn: tuple[Scene, ...], place_mm: Int64, heading: float) -> Iterator[Float64]:
+    def scans(
+        self, around: "_Block", found: tuple[Returns, ...], place_mm: Int64, heading: float
+    ) -> Iterator[Float64]:
         """The points of each draw, in the lidar frame: of the street as it was mapped, then of
         others.
         """
         seeing, beams = self.seeing, self.beams
-        for draw, scene in enumerate(drawn):
-            found = look(scene, place_mm, heading, seeing, beams)
-            if draw < seeing.draws - seeing.worlds:
-                yield virtual_scan(scene, found, place_mm, seeing, beams, draw).points
-            else:
-                yield scan_in_world(found, place_mm, seeing, beams, draw)
+        still = seeing.draws - seeing.worlds
+        for draw in range(still):
+            yield virtual_scan(around.mapped, found, place_mm, seeing, beams, draw).points
+        for draw, scene in enumerate(around.worlds, start=still):
+            met = look(scene, place_mm, heading, seeing, beams)
+            yield scan_in_world(met, place_mm, seeing, beams, draw)
 
     def drives(
         self, cells: Cells | LocalCells, scans: Iterator[Float64], T_map_lidar: Float64
@@ -303,8 +309,10 @@ class _Block:
 
     scene: Scene
     """What is in view."""
-    drawn: tuple[Scene, ...]
-    """The same of each draw: without the balls that its beams pass by."""
+    mapped: Scene
+    """The same without the balls that beams pass by …"""
+    worlds: tuple[Scene, ...]
+    """… and without others in each of the streets that are not as they were mapped."""
     ghosts: Scene | None
     """The ghosts that would be."""
     cells: Cells | LocalCells
