@@ -105,7 +105,7 @@ def settings_of(log: Path, given: argparse.Namespace) -> ts.RunSettings:
         drives=[{"name": name, **mine, **lidar} for name, lidar in LIDARS.items()],
         observe={"range_max": given.range, **own},
         label={"matcher": "autoware"},
-        model={"recipe": "physics"},
+        model={"recipe": "physics", "offset": 0.0},
     )
 
 

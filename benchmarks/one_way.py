@@ -101,7 +101,7 @@ def measured(given: argparse.Namespace) -> pd.DataFrame:
             spacing=2.0,
             observe={"blind_rear_deg": lidar.blind_deg},
             label={"matcher": "autoware"},
-            model={"recipe": "physics"},
+            model={"recipe": "physics", "offset": 0.0},
         )
         ts.run(settings)
         tables.append(ts.dataset(out).rows.assign(street=name))
