@@ -16,7 +16,7 @@ from tilestream.model.dataset import TARGETS, Dataset, matrix
 from tilestream.model.domain import Domain, domain_of
 from tilestream.model.explain import PIECE, Typical, compared, in_words, typical_of
 from tilestream.model.features import with_derived
-from tilestream.model.intervals import LEVEL, NOT_CALIBRATED, Interval, calibrate
+from tilestream.model.intervals import LEVEL, NOT_CALIBRATED, Interval, calibrate, wider_for_few
 from tilestream.model.making import Outside, outside, shared
 from tilestream.model.physics import width_of
 from tilestream.model.registry import DEFAULT, OF_VIRTUAL_DRIVES, REGRESSORS
