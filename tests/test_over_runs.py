@@ -219,3 +219,39 @@ def test_a_vehicle_of_two_tilted_lidars_is_described_in_its_own_frame() -> None:
     assert found["elevation_high_deg"] == pytest.approx(25.0)
     assert found["height_m"] == pytest.approx(2.5)
     assert found["offset_m"] == pytest.approx(5.0)
+
+
+def test_a_place_of_another_world_has_a_wider_interval_and_says_so(
+    model: Any, runs: dict[str, Dataset]
+) -> None:
+    places = runs["vlp"].averaged(model.width).rows.iloc[[0] * 4].reset_index(drop=True)
+    k = model.factors.index("ob_hint")
+    unit = model.domain.distance(
+        model.domain.middle + np.eye(len(model.factors))[[k]] * model.domain.scale[k]
+    )[0]
+    wanted = np.array([0.5, 1.5, 2.0, 50.0])  # in thresholds, from the middle
+    places[list(model.factors)] = model.domain.middle
+    places["ob_hint"] += wanted * model.domain.threshold / unit * model.domain.scale[k]
+    found = predict(model, places)
+    np.testing.assert_allclose(found["domain_distance"], wanted * model.domain.threshold)
+    assert list(found["in_domain"]) == [True, False, False, False]
+    assert found["estimate"].nunique() == 1
+    above = found["high"] - found["estimate"]
+    np.testing.assert_allclose(above / above[0], [1.0, 1.5, 2.0, 3.0])
+    low, _ = model.interval.around(found["estimate"].to_numpy(), np.array([1.0, 1.5, 2.0, 3.0]))
+    np.testing.assert_array_equal(found["low"], low)
+    assert "wider" not in found["reason"][0]
+    for row, times in ((1, "1.5"), (2, "2"), (3, "3")):
+        assert "unlike the training places (ob_hint" in found["reason"][row]
+        assert f"its interval {times} times wider" in found["reason"][row]
+
+
+def test_the_fewer_places_teach_a_model_the_less_its_interval_promises(
+    runs: dict[str, Dataset], model: Any
+) -> None:
+    rows = runs["vlp"].rows
+    few = runs["vlp"].take(np.flatnonzero(rows["path"].isin(["a", "b"])))
+    alone = train(few, recipe="physics")
+    assert alone.interval.blocks == 2
+    assert alone.facts["wider_for_few_blocks"] == pytest.approx(1.296, abs=1e-3)
+    assert model.interval.blocks == 3  # pieces: the same streets with three lidars

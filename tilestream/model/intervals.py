@@ -110,8 +110,9 @@ def wider_for_few(blocks: int, level: float = LEVEL) -> float:
 
     The quantile of Student's t over that of a normal. With a block more that is as hard as the
     hardest, what B blocks lack falls faster than 1 / B: with B^2 degrees of freedom the intervals
-    of 2, 3, 4, 6 and 12 blocks hold 88 to 91 % in the mean over kinds of drives whose blocks differ
-    not at all to a factor of 2.2, and without it 83 % of two blocks (tests/test_model_intervals.py).
+    of 2, 3, 4, 6 and 12 blocks hold 90 % within 3 % in the mean over drives whose blocks differ not
+    at all up to by a factor of 2.2 (one standard deviation), and without it those of two blocks
+    83 % (tests/test_model_intervals.py).
 
     Args:
         blocks: how many, at least 1.

@@ -137,7 +137,7 @@ def _targets(dataset: Dataset) -> set[str]:
 
 def _flat(making: Mapping[str, Any]) -> dict[str, str]:
     """A making with `seeing.name` and `units.name` for what lies below, values as text."""
-    found = {}
+    found: dict[str, str] = {}
     for name, value in making.items():
         below = value.items() if isinstance(value, Mapping) else [("", value)]
         found |= {f"{name}.{key}".rstrip("."): repr(one) for key, one in below}

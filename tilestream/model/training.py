@@ -140,6 +140,7 @@ def train(
         typical = typical_of(whole.matrix(), whole.label(MAIN), whole.columns, pieces)
         domain = domain_of(dataset.matrix(), dataset.pieces)
     settings = regressor.tuned(dataset, MAIN, seed, n_jobs)
+    interval = _interval(dataset, regressor, settings, seed, n_jobs)
     # An axis or a tail that is the same everywhere teaches nothing and is learnt as that constant.
     there = [target for target in TARGETS if target in dataset.rows]
     regressors = {t: regressor.fit(dataset, t, seed, settings, n_jobs) for t in there}
@@ -148,7 +149,7 @@ def train(
         regressors=regressors,
         domain=domain,
         typical=typical,
-        interval=_interval(dataset, regressor, settings, seed, n_jobs),
+        interval=interval,
         factors=tuple(dataset.names),
         made_with=dataset.made_with,
         data_set=next(iter(dataset.data_sets.values()), {}),
@@ -163,6 +164,7 @@ def train(
             "groups": sorted(set(rows["group"])),
             "paths": sorted(set(rows["path"])),
             "blocks": int(rows["block"].nunique()),
+            **({"wider_for_few_blocks": wider_for_few(interval.blocks)} if interval.blocks else {}),
             "lost": dataset.losses,
         },
         card=card_of(dataset),
