@@ -18,6 +18,7 @@ from tilestream.model.making import inputs_of
 from tilestream.model.over_runs import Run, over_runs
 from tilestream.model.splits import BUFFER, OVER_RUNS, PROTOCOLS, leave_path_out, protocols_of
 from tilestream.model.training import check_making, predict, train
+from tilestream.pipeline.jobs.train_over import as_read
 from tilestream.sensor import Sensor
 
 LENGTHS = {"a": 240, "b": 240, "c": 240}
@@ -36,7 +37,9 @@ def making(sensor: Sensor = ts.VLP16, matcher: str = "autoware", **seeing: Any) 
 
 def measured(seed: int, of: dict[str, Any]) -> Dataset:
     found = model_data.with_virtual_drives(model_data.dataset(seed, 0.7, LENGTHS), seed=seed)
-    identity = {"drive": {"as_sensor": "", "true_pose": "log", "registration": of["matcher"]}}
+    identity = {
+        "drive": {"as_sensor": "as recorded", "true_pose": "log", "registration": of["matcher"]}
+    }
     return replace(found, made_with=of, data_sets=identity)
 
 
@@ -255,3 +258,20 @@ def test_the_fewer_places_teach_a_model_the_less_its_interval_promises(
     assert alone.interval.blocks == 2
     assert alone.facts["wider_for_few_blocks"] == pytest.approx(1.296, abs=1e-3)
     assert model.interval.blocks == 3  # pieces: the same streets with three lidars
+
+
+def test_drives_of_one_job_are_each_the_lidar_that_they_are_read_as() -> None:
+    settings = ts.RunSettings(
+        out="run",
+        map={"sources": ["map.las"]},
+        sensor="HDL64",
+        drives=[
+            {"log": "a.mcap"},
+            {"log": "b.mcap", "beams": 16, "range_max": 30.0, "blind_rear_deg": 120.0},
+            {"log": "c.mcap", "deskew": True},
+        ],
+    )
+    found = {group: inputs_of(made) for group, made in as_read(settings).items()}
+    lidars = {name: (one["beams"], one["range_m"]) for name, one in found.items()}
+    assert lidars == {"a": (64.0, 120.0), "b": (16.0, 30.0), "c": (64.0, 120.0)}
+    assert [one["blind_rear_deg"] for one in found.values()] == [0.0, 120.0, 0.0]

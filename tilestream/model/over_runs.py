@@ -9,6 +9,7 @@ import pandas as pd
 from tilestream.errors import ModelError, UsageError
 from tilestream.model.dataset import TARGETS, VIRTUAL_DRIVES, Dataset
 from tilestream.model.making import MAY_DIFFER, SEEING, judged_of, lidar_of, shared
+from tilestream.sensor import AS_RECORDED
 
 PLACES = ("group", "path", "block")
 """What is named `<run>/<name>`."""
@@ -79,8 +80,8 @@ def _makings(name: str, run: Run) -> dict[str, Mapping[str, Any]]:
     """What each labelled group of a run was made with."""
     found = {}
     for group in sorted(set(run.dataset.rows["group"])):
-        as_sensor = run.dataset.data_sets.get(group, {}).get("as_sensor")
-        if as_sensor and group not in run.makings:
+        as_sensor = run.dataset.data_sets.get(group, {}).get("as_sensor", AS_RECORDED)
+        if as_sensor != AS_RECORDED and group not in run.makings:
             raise ModelError(
                 f"run {name!r}: drive {group} is read as {as_sensor}, and the dataset alone does "
                 "not say what that sees: give the run directory"

@@ -4,7 +4,7 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
-from tilestream.errors import UsageError
+from tilestream.errors import SourceNotFoundError, UsageError
 from tilestream.files import Files, place_of
 from tilestream.model.dataset import Dataset
 from tilestream.model.file import save_model
@@ -14,6 +14,7 @@ from tilestream.model.training import Model, train
 from tilestream.pipeline.jobs.run_inputs import making_of, observing_drive
 from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
 from tilestream.pipeline.stages.samples import DatasetFile
+from tilestream.simulation.settings import load_preset
 
 
 def train_over(
@@ -61,21 +62,29 @@ def _run(of: str | os.PathLike[str] | Dataset, district: str | None) -> Run:
     simulated = settings.simulate
     about: dict[str, Any] = {}
     if simulated is not None:
-        about = {"preset": Files.at(simulated.preset).name, "seed": simulated.seed}
+        about = {"preset": _preset(simulated.preset), "seed": simulated.seed}
     city = DISTRICT if simulated is None else simulated.city
-    return Run(measured, district or city, _of_degraded(settings), about)
+    return Run(measured, district or city, as_read(settings), about)
 
 
-def _of_degraded(settings: RunSettings) -> dict[str, Mapping[str, Any]]:
-    """What the drives are made with that are read as another lidar than the vehicle's."""
+def _preset(name: str) -> str:
+    """What a preset is called; one whose file is gone, as its file was."""
+    try:
+        return load_preset(name).preset
+    except SourceNotFoundError:
+        return Files.at(name).name
+
+
+def as_read(settings: RunSettings) -> dict[str, Mapping[str, Any]]:
+    """What the drives of a job are made with, each as the lidar that it is read as."""
     if settings.observe is None:
         return {}
-    whole, found = making_of(settings), {}
+    whole = making_of(settings)
+    found: dict[str, Mapping[str, Any]] = {}
     for drive in settings.drives:
-        if drive.degraded:
-            seen = observing_drive(settings, settings.observe, drive)
-            found[drive.group] = whole | {
-                "sensor": seen.sensor.model_dump(mode="json"),
-                "seeing": seen.seeing.model_dump(mode="json"),
-            }
+        seen = observing_drive(settings, settings.observe, drive)
+        found[drive.group] = whole | {
+            "sensor": seen.sensor.model_dump(mode="json"),
+            "seeing": seen.seeing.model_dump(mode="json"),
+        }
     return found
