@@ -156,16 +156,17 @@ def test_only_recipes_that_know_the_lidar_learn_from_several(runs: dict[str, Dat
 
 
 def test_the_card_has_the_ranges_of_all_runs_and_is_kept(model: Any, tmp_path: Path) -> None:
-    ts_card = model.card
-    inputs = ts_card["inputs"]
+    card = model.card
+    inputs = card["inputs"]
     assert inputs["beams"] == [8.0, 64.0]
     assert inputs["range_m"] == [30.0, 100.0]
     assert inputs["blind_rear_deg"] == [0.0, 120.0]
     assert inputs["matcher.solver"] == ["definite", "raw"]
     assert inputs["height_m"] == [2.0, 2.0]
-    assert len(ts_card["lidars"]) == 3
-    assert ts_card["matchers"] == ["autoware", "default"]
-    assert ts_card["places"] == 720 * 3
+    assert len(card["lidars"]) == 3
+    assert card["matchers"] == ["autoware", "default"]
+    assert card["places"] == 720 * 3
+    assert model.data_set == {"as_sensor": "as recorded", "true_pose": "log"}
     path = tmp_path / "model.skops"
     ts.train_over({"a": measured(1, making())}, recipe="physics", out=path)
     assert load_model(path).card["lidars"] == ["VLP16, 16 beams, 100 m"]

@@ -95,7 +95,8 @@ class Model:
     made_with: Mapping[str, Any]
     """What the factors were computed with: sensor, cell size, units, … (`check_making`)."""
     data_set: Mapping[str, Any]
-    """Identity of the labels: matcher, starts, true pose, cell size, sensor."""
+    """Identity of the labels, as far as it is that of all: matcher, starts, true pose, cell size,
+    sensor."""
     width: float
     """Over what virtual drives are averaged along the route (`averaged_along`) [m]."""
     worst: float
@@ -152,7 +153,7 @@ def train(
         interval=interval,
         factors=tuple(dataset.names),
         made_with=dataset.made_with,
-        data_set=next(iter(dataset.data_sets.values()), {}),
+        data_set=_common(list(dataset.data_sets.values())),
         width=width,
         worst=float(np.quantile(dataset.label(MAIN), WORST)),
         facts={
@@ -169,6 +170,12 @@ def train(
         },
         card=card_of(dataset),
     )
+
+
+def _common(identities: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """What is the same in all identities of labels: of several runs their matchers may differ."""
+    first = next(iter(identities), {})
+    return {k: v for k, v in first.items() if all(one.get(k) == v for one in identities)}
 
 
 def _interval(
