@@ -727,7 +727,7 @@ def test_a_pipeline_that_ships_is_a_job(name: str) -> None:
     settings = read_settings(PIPELINES / f"{name}.yaml")
     assert settings.out
     assert settings.label.matcher == "autoware"
-    assert {p.stem for p in PIPELINES.glob("*.yaml")} == {"shinjuku", "drive", "city"}
+    assert {p.stem for p in PIPELINES.glob("*.yaml")} == {"shinjuku", "drive", "city", "retrain"}
 
 
 def test_the_model_of_one_pipeline_fits_the_other() -> None:

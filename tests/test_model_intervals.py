@@ -6,8 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy import stats
 
-from tilestream.model.intervals import SHARES, calibrate, coverage, with_intervals
+from tilestream.model.intervals import SHARES, calibrate, coverage, wider_for_few, with_intervals
 
 Floats = NDArray[np.float64]
 
@@ -49,11 +50,35 @@ def held_by_new_blocks(bias: float, blocks: int, relative: float, seed: int) -> 
 def test_intervals_hold_what_they_promise_for_new_blocks(
     bias: float, blocks: int, relative: float
 ) -> None:
-    """With the unknown block at infinity they would hold 95 % and more. Three blocks that differ
-    much say too little of a fourth: they hold 85 %.
-    """
-    least = 0.83 if (bias, blocks) == (0.5, 3) else 0.86
+    """With the unknown block at infinity they would hold 95 % and more."""
+    least = 0.84 if (bias, blocks) == (0.5, 3) else 0.86
     assert least < held_by_new_blocks(bias, blocks, relative, seed=blocks) < 0.94
+
+
+@pytest.mark.parametrize("blocks", [2, 3, 4, 6, 12])
+def test_few_blocks_hold_what_they_promise_in_the_mean_over_kinds_of_drives(blocks: int) -> None:
+    """Drives whose blocks differ not at all, up to much. Without the widening two blocks hold 83 %
+    and three 86 %; without the hardest block twice they would hold less still.
+    """
+    rng, held = np.random.default_rng(blocks), []
+    names = np.repeat([f"b{k:02d}" for k in range(blocks)], 40)
+    for bias in (0.0, 0.12, 0.3, 0.5, 0.8):
+        for k in range(60):
+            actual, estimate = drawn(rng, blocks + 12, bias, k % 2)
+            interval = calibrate(actual[:blocks].ravel(), estimate[:blocks].ravel(), names)
+            low, high = interval.around(estimate[blocks:])
+            held.append(((low <= actual[blocks:]) & (actual[blocks:] <= high)).mean())
+    assert np.mean(held) == pytest.approx(0.9, abs=0.03)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(1, 200), st.floats(0.3, 0.99))
+def test_the_fewer_blocks_the_wider_and_of_many_not_at_all(blocks: int, level: float) -> None:
+    wider = wider_for_few(blocks, level)
+    assert wider >= wider_for_few(blocks + 1, level) >= 1.0
+    quantile = stats.t.ppf(0.5 + level / 2.0, blocks**2) / stats.norm.ppf(0.5 + level / 2.0)
+    assert wider == pytest.approx(quantile)
+    assert wider_for_few(1000, level) == pytest.approx(1.0, abs=1e-4)
 
 
 def test_the_constant_follows_how_errors_grow() -> None:
@@ -128,6 +153,7 @@ def test_the_hardest_block_counts_twice(errors: list[list[int]], level: float) -
     scores = [[max(x / up, -x / down) for x in block] for block in errors]
     hardest = max(range(len(scores)), key=lambda k: (np.quantile(scores[k], level), -k))
     size = quantile(scores, level, hardest)
+    size *= stats.t.ppf(0.5 + level / 2.0, len(errors) ** 2) / stats.norm.ppf(0.5 + level / 2.0)
     actual = 1.0 + 0.01 * np.concatenate(errors)
     names = np.repeat([f"b{k}" for k in range(len(errors))], [len(block) for block in errors])
     mixed = np.random.default_rng(0).permutation(len(actual))
@@ -141,8 +167,9 @@ def test_intervals_are_widened_and_cut_at_zero_and_one_block_gives_none() -> Non
     actual, estimate = np.array([0.1, 0.2, 0.4, 0.1]), np.full(4, 0.2)
     interval = calibrate(actual, estimate, np.array(["a", "a", "b", "b"]))
     low, high = interval.around(np.array([0.2, 0.2]), np.array([1.0, 3.0]))
-    np.testing.assert_allclose(low, [0.1, 0.0])
-    np.testing.assert_allclose(high, [0.4, 0.8])  # down 1, up 2 shapes
+    few = wider_for_few(2)
+    np.testing.assert_allclose(low, [0.2 - few * 0.1, 0.0])
+    np.testing.assert_allclose(high, 0.2 + few * np.array([0.2, 0.6]))  # down 1, up 2 shapes
     alone = calibrate(actual, estimate, np.array(["a"] * 4))
     assert alone.blocks == 0
     assert np.isnan([alone.level, alone.above, *np.ravel(alone.around(estimate))]).all()
@@ -165,7 +192,7 @@ def test_coverage_of_a_path_is_calibrated_elsewhere() -> None:
     assert coverage(points(0.11))["covered"].tolist() == [1.0, 1.0, 1.0, 1.0]
     found = coverage(points(0.5)).set_index("path")
     assert found.loc["c", "covered"] == 0.0
-    assert found.loc["c", "width"] == pytest.approx(0.03)
+    assert found.loc["c", "width"] == pytest.approx(0.03 * wider_for_few(4))
     assert found.loc["a", "covered"] == 1.0
     assert found.loc["", "covered"] == pytest.approx(8 / 12)
     at = with_intervals(points(0.5)).groupby("path")[["low", "high"]].first()

@@ -63,6 +63,7 @@ if TYPE_CHECKING:
     from tilestream.pipeline.jobs.run import dataset as dataset
     from tilestream.pipeline.jobs.run import run as run
     from tilestream.pipeline.jobs.run_settings import RunSettings as RunSettings
+    from tilestream.pipeline.jobs.train_over import train_over as train_over
 
 
 def __getattr__(name: str) -> Any:
@@ -71,6 +72,8 @@ def __getattr__(name: str) -> Any:
     """
     if name in ("run", "dataset"):
         return getattr(import_module("tilestream.pipeline.jobs.run"), name)
+    if name == "train_over":
+        return import_module("tilestream.pipeline.jobs.train_over").train_over
     if name == "view":
         return import_module("tilestream.apps.view").view
     if name == "explain":

@@ -20,6 +20,8 @@ from tilestream.kernels.fixed_order import turned
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+AS_RECORDED = "as recorded"
+"""As if by which sensor a log is read that is read as it is."""
 EDGE = 1e-9
 """Slack of angles, so that rounding decides nothing [rad]."""
 

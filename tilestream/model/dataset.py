@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from tilestream.errors import ModelError, UsageError
 from tilestream.factors.along_route import AVERAGED, averaged_along
@@ -28,6 +29,8 @@ LEAST = 1e-4
 """Errors below this count as this, before a logarithm [m]."""
 POINTS_MIN = 50
 """Fewest labelled points that a model is trained on."""
+OF_LIDAR = ("registration", "as_sensor")
+"""What of the identity of labels may differ from run to run: a model over several knows it."""
 VIRTUAL_DRIVES = ("group", "route_id", "sample", "arc_length", "status", *AVERAGED)
 """What is kept of the virtual drives of all places of the drives."""
 
@@ -56,6 +59,13 @@ class Dataset:
         default_factory=lambda: pd.DataFrame(columns=list(VIRTUAL_DRIVES))
     )
     """The virtual drives of all places of the drives, labelled or not, along each drive."""
+    stages: Mapping[str, int] = field(default_factory=dict)
+    """The versions of the stages that made factors and labels; empty: not known."""
+    makings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Of several runs: what the factors of each group were computed with, whole (`over_runs`), and
+    the rows have `street`, `piece`, `district` and `lidar` too. Empty: of one run."""
+    runs: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Of several runs: what is known of each, by its name: district, preset, seed."""
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -70,6 +80,16 @@ class Dataset:
         """How many labels were lost, by reason."""
         counts = self.lost["reason"].value_counts()
         return {str(reason): int(count) for reason, count in sorted(counts.items())}
+
+    @property
+    def streets(self) -> NDArray[np.str_]:
+        """(n,) what is held out as one path: the path, in all runs of its district."""
+        return self.rows["street" if self.makings else "path"].to_numpy(str)
+
+    @property
+    def pieces(self) -> NDArray[np.str_]:
+        """(n,) what is held out as one block: the block, in all runs of its district."""
+        return self.rows["piece" if self.makings else "block"].to_numpy(str)
 
     def matrix(self) -> Float64:
         """(n, f) the features."""
@@ -108,13 +128,14 @@ class Dataset:
         return replace(self, rows=self.rows.assign(**columns))
 
     def rows_of_one_drive(self) -> Int64:
-        """(k,) rows of each path as the drive has it with the most labels there (equal: the first
-        by name): with a repeated drive a random split would put a place on both sides.
+        """(k,) rows of each path (`streets`) as the drive has it with the most labels there (equal:
+        the first by name): with a repeated drive a random split would put a place on both sides.
         """
-        counts = self.rows.groupby(["path", "group"], as_index=False).size()
+        rows = self.rows[["group"]].assign(path=self.streets)
+        counts = rows.groupby(["path", "group"], as_index=False).size()
         order = counts.sort_values(["path", "size", "group"], ascending=[True, False, True])
         most = order.drop_duplicates("path").set_index("path")["group"]
-        chosen = self.rows["path"].map(most) == self.rows["group"]
+        chosen = rows["path"].map(most) == rows["group"]
         return np.flatnonzero(chosen.to_numpy())
 
     def groups(self, names: Sequence[str]) -> "Dataset":
@@ -146,8 +167,8 @@ class Dataset:
 
         Raises:
             ModelError: fewer than 50 labelled points, labels all alike, a path of one point (`join`
-                leaves none), or labels of different identities (matcher, true pose, sensor)
-                together.
+                leaves none), or labels of different identities (starts, true pose; of one run
+                matcher and sensor too) together.
         """
         if len(self) < POINTS_MIN:
             losses = "; ".join(f"{count} {reason}" for reason, count in self.losses.items())
@@ -166,11 +187,12 @@ class Dataset:
                 raise ModelError(
                     f"path {path!r} has one point only: leave it out or drive more of it"
                 )
-        for name in ("true_pose", "as_sensor"):
+        for name in ("true_pose",) if self.makings else ("true_pose", "as_sensor"):
             kinds = sorted(set(self.rows[name]))
             if len(kinds) > 1:
                 raise ModelError(f"labels of different {name} ({', '.join(kinds)}): choose groups")
-        _one_identity(self.data_sets)
+        may_differ = OF_LIDAR if self.makings else ()
+        _one_identity(self.data_sets, may_differ)
 
 
 def nearest_along(rows: pd.DataFrame, others: pd.DataFrame, reach: float) -> pd.DataFrame:
@@ -217,7 +239,9 @@ def made_with(columns: Sequence[Column], sensor: Sensor, cell_size: float) -> di
     }
 
 
-def _one_identity(data_sets: Mapping[str, Mapping[str, Any]]) -> None:
+def _one_identity(
+    data_sets: Mapping[str, Mapping[str, Any]], may_differ: Sequence[str] = ()
+) -> None:
     """Refuse labels of different making.
 
     Raises:
@@ -226,7 +250,8 @@ def _one_identity(data_sets: Mapping[str, Mapping[str, Any]]) -> None:
     names = sorted(data_sets)
     for other in names[1:]:
         one, two = data_sets[names[0]], data_sets[other]
-        differ = sorted(k for k in set(one) | set(two) if one.get(k) != two.get(k))
+        names_of = (set(one) | set(two)) - set(may_differ)
+        differ = sorted(k for k in names_of if one.get(k) != two.get(k))
         if differ:
             raise ModelError(
                 f"groups {names[0]!r} and {other!r} were labelled with different "

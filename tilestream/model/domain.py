@@ -15,6 +15,12 @@ RIDGE = 1e-2
 """Variance added in every direction, of scaled factors: ratios that sum to 1 make it singular."""
 
 
+TINY = 1e-12
+"""Threshold of training places that are all alike."""
+WIDEST = 3.0
+"""An interval outside is at most so many times wider: beyond, nobody knows how wrong it is."""
+
+
 @dataclass(frozen=True, eq=False)
 class Domain:
     """The training factors as one cloud: distances from its middle."""
@@ -39,6 +45,13 @@ class Domain:
                 part += z[:, k] * row[k]
             total += part * part
         return np.sqrt(total / len(self.middle))
+
+    def widen(self, distance: Float64) -> Float64:
+        """(n,) how many times wider the interval is at these distances: 1 up to the threshold,
+        then distance / threshold, at most `WIDEST`.
+        """
+        wider: Float64 = np.clip(distance / max(self.threshold, TINY), 1.0, WIDEST)
+        return wider
 
     def farthest(self, X: Float64) -> NDArray[np.int64]:
         """(n,) the factor that lies farthest out on its own."""

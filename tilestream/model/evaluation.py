@@ -12,7 +12,7 @@ from tilestream.model.figures import FIGURES, difference, with_spans
 from tilestream.model.physics import width_of
 from tilestream.model.registry import COMPETITORS
 from tilestream.model.regressor import Regressor
-from tilestream.model.splits import PROTOCOLS, Split, block_splits
+from tilestream.model.splits import Split, block_splits, protocols_of
 from tilestream.records import Column
 
 CRITERIA = ("FS", "RQ", "LY", "LS")
@@ -41,8 +41,9 @@ def held_out(
     """What a competitor estimates for points that it has not seen.
 
     Returns:
-        A row per held-out point: `row` of the dataset, `fold`, `group`, `path`, `block`,
-        `arc_length` [m], `actual`, `estimate`, `median` (of the training part).
+        A row per held-out point: `row` of the dataset, `fold`, `group`, `path` and `block` (of
+        several runs `Dataset.streets` and `pieces`: what must not calibrate itself), `arc_length`
+        [m], `actual`, `estimate`, `median` (of the training part).
     """
     parts = []
     for split in splits:
@@ -50,6 +51,8 @@ def held_out(
         averaged = dataset.averaged(width_of(dataset.take(split.train)))
         train, test = averaged.take(split.train), averaged.take(split.test)
         part = test.rows[["group", "path", "block", "arc_length"]].assign(
+            path=test.streets,
+            block=test.pieces,
             row=split.test,
             fold=split.name,
             actual=test.label(target),
@@ -88,7 +91,7 @@ def cross_validate(
         The points of each protocol (`held_out`), or why it cannot be followed on this dataset.
     """
     found: dict[str, pd.DataFrame | str] = {}
-    for protocol in PROTOCOLS:
+    for protocol in protocols_of(dataset):
         try:
             splits = protocol.splits(dataset, seed)
         except ModelError as error:

@@ -80,6 +80,7 @@ def save_model(model: Model, path: str | os.PathLike[str]) -> None:
         "width": model.width,
         "worst": model.worst,
         "facts": dict(model.facts),
+        "card": dict(model.card),
     }
     content = {  # "forests" is what version 0.1 calls the regressors
         "facts": json.dumps(facts, sort_keys=True),
@@ -226,4 +227,5 @@ def _model(content: Mapping[str, Any], facts: Mapping[str, Any]) -> Model:
         width=float(facts["width"]),
         worst=float(facts["worst"]),
         facts=facts["facts"],
+        card=facts.get("card", {}),  # files of older versions have none
     )

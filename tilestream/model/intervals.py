@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from scipy.special import ndtri, stdtrit
 
 from tilestream.model.bootstrap import resampled
 from tilestream.model.dataset import LEAST
@@ -97,11 +98,28 @@ def calibrate(
         sides = [max(_quantile(x, even, SIDE), 0.0) for x in (-miss, miss)]
         down, up = (max(side, LEAST_SIDE * max(sides), TINY) for side in sides)
         score = np.maximum(miss / up, -miss / down)
-        size = _of_blocks(score, index, level)
+        size = _of_blocks(score, index, level) * wider_for_few(len(names), level)
         interval = Interval(level, constant, size * down, size * up, len(names))
         low, high = interval.around(estimate)
         found.append((float(even @ (high - low)), interval))
     return min(found, key=lambda one: one[0])[1]
+
+
+def wider_for_few(blocks: int, level: float = LEVEL) -> float:
+    """How many times longer an interval is for being calibrated on few blocks; 1 for many.
+
+    The quantile of Student's t over that of a normal. With a block more that is as hard as the
+    hardest, what B blocks lack falls faster than 1 / B: with B^2 degrees of freedom the intervals
+    of 2, 3, 4, 6 and 12 blocks hold 90 % within 3 % in the mean over drives whose blocks differ not
+    at all up to by a factor of 2.2 (one standard deviation), and without it those of two blocks
+    83 % (tests/test_model_intervals.py).
+
+    Args:
+        blocks: how many, at least 1.
+        level: share of the places to hold, in (0, 1).
+    """
+    share = 0.5 + 0.5 * level
+    return float(stdtrit(float(blocks) ** 2, share) / ndtri(share))
 
 
 def _of_blocks(score: Float64, index: NDArray[np.int64], level: float) -> float:

@@ -16,6 +16,8 @@ BUFFER = 100.0
 vicinity."""
 FOLDS = 5
 """Parts that the blocks are dealt into."""
+APART = 1e8
+"""How far districts are from each other, whatever their coordinates [m]."""
 TRAIN_MIN = 20
 """Fewest training points of a split."""
 
@@ -60,7 +62,7 @@ def leave_path_out(dataset: Dataset, buffer: float = BUFFER) -> list[Split]:
     Raises:
         ModelError: a single path, or too few points left to train.
     """
-    paths = dataset.rows["path"].to_numpy(str)
+    paths = dataset.streets
     names = np.unique(paths)
     if len(names) < 2:
         raise ModelError(f"one path only ({names[0]}): leaving it out leaves nothing to train on")
@@ -73,7 +75,7 @@ def block_splits(dataset: Dataset, folds: int = FOLDS, buffer: float = BUFFER) -
     Raises:
         ModelError: a single block, or too few points left to train.
     """
-    blocks = dataset.rows["block"].to_numpy(str)
+    blocks = dataset.pieces
     names = np.unique(blocks)
     if len(names) < 2:
         raise ModelError(f"one block only ({names[0]}): the drive is too short to be divided")
@@ -87,10 +89,55 @@ def nested_splits(dataset: Dataset, folds: int) -> list[Split]:
     Raises:
         ModelError: a single block, or too few points left to train.
     """
-    paths = dataset.rows["path"].to_numpy(str)
+    paths = dataset.streets
     if len(np.unique(paths)) < 3:
         return block_splits(dataset, folds)
     return _dealt(dataset, paths, folds, BUFFER)
+
+
+def leave_lidar_out(dataset: Dataset) -> list[Split]:
+    """Each lidar is estimated on some streets from the other lidars on other streets, dealt into
+    folds: the same street with another lidar does not train.
+
+    Raises:
+        ModelError: a single lidar, or too few points left to train.
+    """
+    lidars = _of_several(dataset, "lidar")
+    names, streets = np.unique(dataset.streets, return_inverse=True)
+    folds = min(FOLDS, len(names))
+    found = []
+    for lidar in np.unique(lidars):
+        own = lidars == lidar
+        for k in range(folds):
+            test = own & (streets % folds == k)
+            if test.any():
+                found.append(_held_out(dataset, f"{lidar}, fold {k}", test, BUFFER, ~own))
+    return found
+
+
+def leave_district_out(dataset: Dataset) -> list[Split]:
+    """Each district is estimated from the others.
+
+    Raises:
+        ModelError: a single district, or too few points left to train.
+    """
+    districts = _of_several(dataset, "district")
+    return [
+        _held_out(dataset, f"district {name}", districts == name, BUFFER)
+        for name in np.unique(districts)
+    ]
+
+
+def _of_several(dataset: Dataset, name: str) -> NDArray[np.str_]:
+    """(n,) the lidar or the district of each row.
+
+    Raises:
+        ModelError: there is one only.
+    """
+    there = dataset.rows[name].to_numpy(str) if dataset.makings else np.array(["of this run"])
+    if len(np.unique(there)) < 2:
+        raise ModelError(f"one {name} only ({there[0]}): leaving it out leaves nothing to train on")
+    return there
 
 
 def _dealt(dataset: Dataset, units: NDArray[np.str_], folds: int, buffer: float) -> list[Split]:
@@ -101,11 +148,22 @@ def _dealt(dataset: Dataset, units: NDArray[np.str_], folds: int, buffer: float)
     return [_held_out(dataset, f"fold {k}", fold == k, buffer) for k in range(folds)]
 
 
-def _held_out(dataset: Dataset, name: str, test: NDArray[np.bool_], buffer: float) -> Split:
+def _held_out(
+    dataset: Dataset,
+    name: str,
+    test: NDArray[np.bool_],
+    buffer: float,
+    may_train: NDArray[np.bool_] | None = None,
+) -> Split:
+    """A split; of what is not held out, what may train and lies beyond `buffer` in its district."""
     at = dataset.rows[["x", "y"]].to_numpy(np.float64)
     at = at - at[0]
+    if dataset.makings:  # each district has a frame of its own
+        _, district = np.unique(dataset.rows["district"].to_numpy(str), return_inverse=True)
+        at = np.column_stack([at, APART * district])
     distance, _ = cKDTree(at[test]).query(at)
-    train = np.flatnonzero(~test & (distance > buffer))
+    there = ~test if may_train is None else ~test & may_train
+    train = np.flatnonzero(there & (distance > buffer))
     if len(train) < TRAIN_MIN:
         raise ModelError(
             f"{name}: {len(train)} points lie beyond {buffer:g} m of it, too few to train on: "
@@ -134,3 +192,24 @@ PROTOCOLS = (
         lambda dataset, _: block_splits(dataset),
     ),
 )
+OVER_RUNS = (
+    Protocol(
+        "lidar",
+        "Each lidar is estimated by a model that has seen only the other lidars, and no street "
+        "that it estimates, none of it within 100 m: how well a lidar never trained with is "
+        "estimated.",
+        lambda dataset, _: leave_lidar_out(dataset),
+    ),
+    Protocol(
+        "district",
+        "Each district is estimated by a model that has seen only the others: how well a city "
+        "never driven is estimated.",
+        lambda dataset, _: leave_district_out(dataset),
+    ),
+)
+"""What a dataset of several runs allows besides."""
+
+
+def protocols_of(dataset: Dataset) -> tuple[Protocol, ...]:
+    """How a dataset is divided: `PROTOCOLS`, and `OVER_RUNS` where it is of several runs."""
+    return (*PROTOCOLS, *OVER_RUNS) if dataset.makings else PROTOCOLS

@@ -1,7 +1,7 @@
 """A model for every place: train it on a dataset, apply it to a table of factors."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -11,13 +11,15 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from tilestream.errors import ModelError, UsageError
+from tilestream.model.card import JUDGED, card_of
 from tilestream.model.dataset import TARGETS, Dataset, matrix
 from tilestream.model.domain import Domain, domain_of
 from tilestream.model.explain import PIECE, Typical, compared, in_words, typical_of
 from tilestream.model.features import with_derived
-from tilestream.model.intervals import LEVEL, NOT_CALIBRATED, Interval, calibrate
+from tilestream.model.intervals import LEVEL, NOT_CALIBRATED, Interval, calibrate, wider_for_few
+from tilestream.model.making import Outside, outside, shared
 from tilestream.model.physics import width_of
-from tilestream.model.registry import DEFAULT, REGRESSORS
+from tilestream.model.registry import DEFAULT, OF_VIRTUAL_DRIVES, REGRESSORS
 from tilestream.model.regressor import Regressor, held_out_estimates
 from tilestream.model.splits import block_splits
 from tilestream.records import Column, Float64
@@ -58,7 +60,8 @@ PREDICTION_COLUMNS = (
         "in_domain",
         "place",
         "1",
-        "Whether the place is like the training places; empty: not known, nothing was trained.",
+        "Whether place, lidar and matcher are like those of the training places; empty: not known, "
+        "nothing was trained.",
         "distance at most the 99 % quantile of held-out blocks",
         dtype="bool",
     ),
@@ -92,13 +95,17 @@ class Model:
     made_with: Mapping[str, Any]
     """What the factors were computed with: sensor, cell size, units, … (`check_making`)."""
     data_set: Mapping[str, Any]
-    """Identity of the labels: matcher, starts, true pose, cell size, sensor."""
+    """Identity of the labels, as far as it is that of all: matcher, starts, true pose, cell size,
+    sensor."""
     width: float
     """Over what virtual drives are averaged along the route (`averaged_along`) [m]."""
     worst: float
     """Estimates above this are given a reason [m]."""
     facts: Mapping[str, Any]
     """How it was trained: recipe, settings, seed, points, paths, targets left out and why."""
+    card: Mapping[str, Any] = field(default_factory=dict)
+    """What it was trained on, and over which lidars and matchers it holds (`card_of`); empty: of
+    an older version, for one lidar."""
 
 
 def train(
@@ -114,10 +121,15 @@ def train(
 
     Raises:
         ModelError: the dataset is too small, all alike, or mixed (`Dataset.check`).
-        UsageError: an unknown recipe.
+        UsageError: an unknown recipe, or one that does not know the lidar, of several runs.
     """
     if recipe not in REGRESSORS:
         raise UsageError(f"no recipe {recipe!r}: choose from {', '.join(sorted(REGRESSORS))}")
+    if dataset.makings and recipe not in OF_VIRTUAL_DRIVES:
+        raise UsageError(
+            f"recipe {recipe!r} does not know the lidar: over several runs choose from "
+            f"{', '.join(OF_VIRTUAL_DRIVES)}"
+        )
     regressor = REGRESSORS[recipe]
     dataset.check(MAIN)
     width = width_of(dataset)
@@ -127,8 +139,9 @@ def train(
     rows = dataset.rows
     with threadpool_limits(1, "blas"):  # how many threads share a product shows in its last bits
         typical = typical_of(whole.matrix(), whole.label(MAIN), whole.columns, pieces)
-        domain = domain_of(dataset.matrix(), rows["block"].to_numpy(str))
+        domain = domain_of(dataset.matrix(), dataset.pieces)
     settings = regressor.tuned(dataset, MAIN, seed, n_jobs)
+    interval = _interval(dataset, regressor, settings, seed, n_jobs)
     # An axis or a tail that is the same everywhere teaches nothing and is learnt as that constant.
     there = [target for target in TARGETS if target in dataset.rows]
     regressors = {t: regressor.fit(dataset, t, seed, settings, n_jobs) for t in there}
@@ -137,10 +150,10 @@ def train(
         regressors=regressors,
         domain=domain,
         typical=typical,
-        interval=_interval(dataset, regressor, settings, seed, n_jobs),
+        interval=interval,
         factors=tuple(dataset.names),
         made_with=dataset.made_with,
-        data_set=next(iter(dataset.data_sets.values()), {}),
+        data_set=_common(list(dataset.data_sets.values())),
         width=width,
         worst=float(np.quantile(dataset.label(MAIN), WORST)),
         facts={
@@ -152,9 +165,17 @@ def train(
             "groups": sorted(set(rows["group"])),
             "paths": sorted(set(rows["path"])),
             "blocks": int(rows["block"].nunique()),
+            **({"wider_for_few_blocks": wider_for_few(interval.blocks)} if interval.blocks else {}),
             "lost": dataset.losses,
         },
+        card=card_of(dataset),
     )
+
+
+def _common(identities: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """What is the same in all identities of labels: of several runs their matchers may differ."""
+    first = next(iter(identities), {})
+    return {k: v for k, v in first.items() if all(one.get(k) == v for one in identities)}
 
 
 def _interval(
@@ -176,8 +197,7 @@ def _interval(
         return NOT_CALIBRATED
     fit = partial(regressor.fit, target=MAIN, seed=seed, settings=settings, n_jobs=n_jobs)
     estimate = held_out_estimates(dataset, splits, fit)
-    blocks = dataset.rows["block"].to_numpy(str)
-    return calibrate(dataset.label(MAIN), estimate, blocks, LEVEL)
+    return calibrate(dataset.label(MAIN), estimate, dataset.pieces, LEVEL)
 
 
 def predict(
@@ -203,8 +223,7 @@ def predict(
         ModelError: a factor that the table lacks or that is no number, or factors of another
             making; says which.
     """
-    if made_with is not None:
-        check_making(model, made_with)
+    strange = [] if made_with is None else check_making(model, made_with)
     table = with_derived(factors)
     X = _matrix(model, table)
     good = np.asarray(np.isfinite(X).all(axis=1))
@@ -213,14 +232,15 @@ def predict(
         places = pd.DataFrame(X[good], columns=list(model.factors))
         for target, regressor in model.regressors.items():
             out[ESTIMATES[target]][good] = regressor.predict(places)
-        out["low"], out["high"] = model.interval.around(out["estimate"])
         out["domain_distance"][good] = model.domain.distance(X[good])
-    in_domain = np.logical_and(good, out["domain_distance"] <= model.domain.threshold)
+    widen = model.domain.widen(out["domain_distance"])
+    out["low"], out["high"] = model.interval.around(out["estimate"], widen)
+    in_domain = good & (out["domain_distance"] <= model.domain.threshold) & (not strange)
     columns: dict[str, Any] = {
         **out,
         "in_domain": in_domain,
         "status": np.where(good, "done", "missing").astype(object),
-        "reason": _reasons(model, table, X, out["estimate"], good, in_domain),
+        "reason": _reasons(model, table, X, out, good, strange),
     }
     return pd.DataFrame({c.name: columns[c.name] for c in PREDICTION_COLUMNS}, index=factors.index)
 
@@ -235,17 +255,26 @@ def _matrix(model: Model, table: pd.DataFrame) -> Float64:
     return matrix(table, model.factors)
 
 
-def check_making(model: Model, made_with: Mapping[str, Any]) -> None:
+def check_making(model: Model, made_with: Mapping[str, Any]) -> list[Outside]:
     """Refuse factors that were computed otherwise than those that a model was trained on.
+
+    A model of several lidars judges what its card says may differ (lidar, its height, matcher,
+    usable range, blind sector) by the range that it was trained over, and refuses the rest.
 
     Args:
         model: a trained or loaded model.
         made_with: what the factors were computed with: `dataset.made_with`, and what else the job
             knows (height of the lidar, thinning of the map, how the virtual drive sees).
 
+    Returns:
+        The inputs outside of what the model was trained over, whose estimates are out of domain.
+
     Raises:
         ModelError: names what differs, and says what to do.
     """
+    judged = model.card.get(JUDGED, [])
+    strange = outside(model.card["inputs"], made_with) if judged else []
+    made_with = shared(made_with, judged)
     if "seeing" in model.made_with and "seeing" not in made_with:
         raise ModelError("the model needs the virtual drive: give observe in the config")
     if "seeing" in made_with and "seeing" not in model.made_with:
@@ -279,6 +308,7 @@ def check_making(model: Model, made_with: Mapping[str, Any]) -> None:
                 f"{name} does not match: the model was trained with {trained!r}, the table was "
                 f"made with {given!r}: train a model for it"
             )
+    return strange
 
 
 def _short(values: Mapping[str, Any], names: Sequence[str]) -> str:
@@ -292,32 +322,43 @@ def _reasons(
     model: Model,
     table: pd.DataFrame,
     X: Float64,
-    estimate: Float64,
+    out: Mapping[str, Float64],
     good: NDArray[np.bool_],
-    in_domain: NDArray[np.bool_],
+    strange: Sequence[Outside],
 ) -> list[str]:
     """(n,) words for the worst places, those outside the domain and those without an estimate; else
     empty.
     """
     words = np.full(len(X), "", dtype=object)
-    worst = np.flatnonzero(good & (estimate > model.worst))
+    worst = np.flatnonzero(good & (out["estimate"] > model.worst))
     if worst.size:
         places = pd.DataFrame(X[worst], columns=list(model.factors))
         added = model.regressors[MAIN].contributions(places)
         values = _values(table.iloc[worst], model.typical.names)
         words[worst] = in_words(added, model.factors, values, model.typical)
-    strange = np.flatnonzero(good & ~in_domain)
-    for row, k in zip(strange, model.domain.farthest(X[strange]), strict=True):
+    distance = out["domain_distance"]
+    unlike = np.flatnonzero(good & (distance > model.domain.threshold))
+    wider = model.domain.widen(distance[unlike])
+    for row, k, times in zip(unlike, model.domain.farthest(X[unlike]), wider, strict=True):
         which = model.typical.names.index(model.factors[k])
         figures = compared(which, X[row, k], model.typical, named=True)
-        unlike = f"unlike the training places ({figures})"
-        words[row] = f"{words[row]}; {unlike}" if words[row] else unlike
+        told = f"unlike the training places ({figures})"
+        told += "" if np.isnan(model.interval.level) else f", its interval {times:.2g} times wider"
+        words[row] = f"{words[row]}; {told}" if words[row] else told
+    if strange:
+        otherwise = f"seen otherwise than where the model was trained ({_listed(strange)})"
+        for row in np.flatnonzero(good):
+            words[row] = f"{words[row]}; {otherwise}" if words[row] else otherwise
     given = table["reason"].fillna("").astype(str).to_numpy() if "reason" in table else None
     for row in np.flatnonzero(~good):
         bad = [name for name, x in zip(model.factors, X[row], strict=True) if not np.isfinite(x)]
         why = f"no estimate: {bad[0]} is not a number"
         words[row] = f"{why}: {given[row]}" if given is not None and given[row] else why
     return [str(word) for word in words]
+
+
+def _listed(strange: Sequence[Outside]) -> str:
+    return "; ".join(map(str, strange))
 
 
 def _values(table: pd.DataFrame, names: Sequence[str]) -> Float64:

@@ -13,6 +13,7 @@ from tilestream.apps.info.record import Info, Kind
 from tilestream.errors import TilestreamError
 from tilestream.files import Files
 from tilestream.marks import unsealed
+from tilestream.model.card import card_told
 from tilestream.model.file import load_model
 from tilestream.notes import Notes, shared
 from tilestream.pipeline.jobs.inventory import INVENTORY
@@ -137,10 +138,12 @@ def _of_model(path: str, _: LogOptions) -> Info:
         coverage={"factors": len(model.factors), "targets": len(model.regressors)},
         contents=[
             *(f"for {one['name']}" for one in sensors),
+            *([] if sensors else [f"for {lidar}" for lidar in model.card.get("lidars", [])]),
             f"factors: {', '.join(model.factors)}",
             f"targets: {', '.join(model.regressors)}",
             *(f"{name}: {value}" for name, value in {**made, **model.facts}.items()),
             *(f"labels: {name}: {value}" for name, value in model.data_set.items()),
+            *(f"card: {line}" for line in card_told(model.card)),
         ],
     )
 

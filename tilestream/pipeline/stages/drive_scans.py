@@ -17,6 +17,7 @@ from tilestream.formats.registry import state_of
 from tilestream.marks import hash_of
 from tilestream.pipeline.engine.stage import Counts
 from tilestream.records import Scan
+from tilestream.sensor import AS_RECORDED
 from tilestream.settings import LogOptions
 
 
@@ -48,7 +49,7 @@ class Reading:
             f"rear blind {self.blind_rear_deg:g} deg" if self.blind_rear_deg else "",
             "de-skewed" if self.deskew else "",
         ]
-        return ", ".join(part for part in parts if part) or "as recorded"
+        return ", ".join(part for part in parts if part) or AS_RECORDED
 
     def __post_init__(self) -> None:
         """Refuse what no scan could be read as, before any task runs.

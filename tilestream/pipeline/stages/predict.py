@@ -25,7 +25,7 @@ MODEL_BYTES = 300_000_000
 
 @stage(
     "predict",
-    version=5,
+    version=6,
     memory=lambda counts: MODEL_BYTES + BYTES_PER_ROW * counts["places"],
     seconds=0.004,
     columns=(*PLACE_COLUMNS, *PREDICTION_COLUMNS),

@@ -19,7 +19,10 @@ from tilestream.model.features import features_of
 from tilestream.model.join import join
 from tilestream.pipeline.engine.outputs import Facts, Made, Parquet, Stored
 from tilestream.pipeline.engine.stage import stage
-from tilestream.pipeline.stages.label import ERROR_COLUMNS
+from tilestream.pipeline.stages.factors import factors_drive
+from tilestream.pipeline.stages.label import ERROR_COLUMNS, label
+from tilestream.pipeline.stages.observe import observe_drive
+from tilestream.pipeline.stages.register import register
 from tilestream.records import Column
 from tilestream.tables import read_mark, read_tables, write_table
 
@@ -92,6 +95,7 @@ class DatasetFile(Parquet):
             "features": dataset.names,
             "made_with": dict(dataset.made_with),
             "data_sets": {name: dict(facts) for name, facts in dataset.data_sets.items()},
+            "stages": dict(dataset.stages),
         }
         write_table(self.path, rows, kept, Mark("done", identity=identity, facts=facts))
         return {"rows": len(rows)}
@@ -126,7 +130,12 @@ def _dataset(file: DatasetFile, identity: str) -> Dataset:  # noqa: ARG001 - ano
     columns = tuple(known[name] for name in facts["features"])
     lost, seen = (read_tables([file._beside(name)]) for name in ("lost", "virtual_drives"))
     rows = read_tables([file.path])
-    return Dataset(rows, columns, lost, facts["made_with"], facts["data_sets"], seen)
+    stages = facts.get("stages", {})  # those of older versions do not say it
+    return Dataset(rows, columns, lost, facts["made_with"], facts["data_sets"], seen, stages)
+
+
+MAKERS = (factors_drive, observe_drive, register, label)
+"""The stages that make what is joined."""
 
 
 @stage(
@@ -171,6 +180,7 @@ def samples(
         made_with=making,
         data_sets={name: tables[0].facts["data_set"] for name, tables in measured.items()},
     )
+    joined = replace(joined, stages={one.name: one.version for one in MAKERS})
     seen = [_rows(tables).assign(group=name) for name, tables in of_group["observed"].items()]
     names = list(VIRTUAL_DRIVES)
     return replace(joined, virtual_drives=pd.concat(seen)[names]) if seen else joined

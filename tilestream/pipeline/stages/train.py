@@ -76,7 +76,7 @@ def _model(path: str, state: str) -> Model:  # noqa: ARG001 - other bytes are an
 
 @stage(
     "train",
-    version=5,
+    version=6,
     memory=lambda counts: FOREST_BYTES + BYTES_PER_ROW * counts["places"],
     seconds=80.0,
 )
