@@ -238,3 +238,10 @@ def test_bounds_that_cannot_be_are_those_of_the_points(
     found = describe(tmp_path / name)
     assert found.bounds == ((5.0, 6.0, 7.0), (8.0, 9.0, 10.0))
     assert "the bounds in its header" in found.notes[0]
+
+
+def test_the_same_points_have_the_same_bytes_on_any_day(tmp_path: Path) -> None:
+    write_las(tmp_path / "a.laz", np.arange(30.0).reshape(10, 3))
+    day = laspy.read(tmp_path / "a.laz").header.creation_date
+    assert day is not None
+    assert (day.year, day.month, day.day) == (1970, 1, 1)

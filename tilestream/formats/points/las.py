@@ -12,6 +12,7 @@ import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import date
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -48,6 +49,8 @@ _HEADER_1_4 = struct.Struct("<QIQ")
 """Where the EVLRs start, number of EVLRs, points: from byte 235 of the header of LAS 1.4."""
 _VLR_MIN = 54
 _EVLR = struct.Struct("<2x16sHQ32x")
+NO_DAY = date(1970, 1, 1)
+"""Written as the day of creation: the same points have the same bytes on any day."""
 _SCALE = 0.001
 """What the writer rounds coordinates to [m]."""
 _INT32 = np.dtype("<i4")
@@ -375,6 +378,7 @@ def write_las(path: str | os.PathLike[str], points: ArrayLike, *, crs: str | Non
     if not np.isfinite(table).all():
         raise UsageError(f"{os.fspath(path)}: LAS holds no NaN or infinite coordinates")
     header = laspy.LasHeader(version="1.4", point_format=6)
+    header.creation_date = NO_DAY
     header.scales = np.full(3, _SCALE)
     header.offsets = (
         np.round((table.min(axis=0) + table.max(axis=0)) / 2) if len(table) else np.zeros(3)

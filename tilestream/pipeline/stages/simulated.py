@@ -126,7 +126,7 @@ class DriveLog(_WholeFile):
 
 @stage(
     "survey",
-    version=1,
+    version=2,
     memory=lambda counts: SCENE_BYTES + counts["rays"] * BYTES_PER_RAY,
     seconds=0.07,
 )
