@@ -51,8 +51,8 @@ from scipy.stats import spearmanr
 from street_tiles import TILE, Floats, long_street
 
 import tilestream as ts
+from tilestream.factors.hessian import hessian_factors
 from tilestream.factors.observability import (
-    hessian_factors,
     in_view,
     observability,
     whole_places,

@@ -228,7 +228,7 @@ def test_another_processor_agrees_within_what_is_stated(tmp_path: Path) -> None:
 MAY = {
     "apps/camera.py": "a picture, no table",
     "factors/local_similarity.py": "the weights of a fit: a constant",
-    "factors/observability.py": "6 x 6 of one place",
+    "factors/hessian.py": "6 x 6 of one place",
     "factors/virtual_drive.py": "over the starts of one place",
     "formats/logs/frames.py": "4 x 4 of one pose",
     "formats/logs/lidar_poses.py": "4 x 4 of one pose",

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 import tilestream as ts
 from tilestream.cli import run as command
 from tilestream.errors import RegistrationError, UsageError
-from tilestream.factors.observability import hessian_factors
+from tilestream.factors.hessian import hessian_factors
 from tilestream.formats.routes import route_of
 from tilestream.marks import canonical
 from tilestream.matcher import CropSettings, RegistrationSettings

@@ -11,10 +11,9 @@ from scenes import PLACES
 
 import tilestream as ts
 from tilestream.errors import UsageError
+from tilestream.factors.hessian import hessian_factors, information
 from tilestream.factors.observability import (
     COLUMNS,
-    hessian_factors,
-    information,
     observability,
 )
 from tilestream.factors.surfels import in_view, surfels_in
