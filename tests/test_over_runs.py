@@ -243,7 +243,7 @@ def test_a_place_of_another_world_has_a_wider_interval_and_says_so(
     above = found["high"] - found["estimate"]
     np.testing.assert_allclose(above / above[0], [1.0, 1.5, 2.0, 3.0])
     low, _ = model.interval.around(found["estimate"].to_numpy(), np.array([1.0, 1.5, 2.0, 3.0]))
-    np.testing.assert_array_equal(found["low"], low)
+    np.testing.assert_allclose(found["low"], low, rtol=1e-9)
     assert "wider" not in found["reason"][0]
     for row, times in ((1, "1.5"), (2, "2"), (3, "3")):
         assert "unlike the training places (ob_hint" in found["reason"][row]
