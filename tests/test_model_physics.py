@@ -214,3 +214,25 @@ def test_a_dataset_is_averaged_along_its_drives(plain: Dataset) -> None:
     np.testing.assert_array_equal(back["vd_mean"], plain.rows["vd_mean"])
     some = np.arange(0, len(plain), 7)  # labels of few places, neighbours of all
     np.testing.assert_array_equal(plain.take(some).averaged(2.0).rows["vd_mean"], means[some])
+
+
+@pytest.mark.parametrize(
+    ("part", "forged"),
+    [
+        ("trees", 3),
+        ("trees", [3]),
+        ("trees", None),
+        ("weight", np.array([0.3])),
+        ("weight", 0.5),
+        ("physics", {}),
+        ("physics", None),
+    ],
+)
+def test_a_forged_correction_is_refused_by_name(part: str, forged: object, hinted: Dataset) -> None:
+    fitted = Corrected.fit(hinted, "error_mean")
+    whole = fitted.save()
+    known = (fitted.factors, dict(fitted.settings))
+    again = Corrected.load(whole, "error_mean", *known)
+    np.testing.assert_array_equal(again.predict(hinted.rows), fitted.predict(hinted.rows))
+    with pytest.raises(ModelError, match="a damaged model file"):
+        Corrected.load({**whole, part: forged}, "error_mean", *known)

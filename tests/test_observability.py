@@ -1,6 +1,7 @@
 """Observability and the virtual drive: closed forms, invariances, any tiling, bad places named."""
 
 import math
+import sys
 from itertools import combinations_with_replacement, product
 from pathlib import Path
 
@@ -248,6 +249,37 @@ def test_every_column_is_there_and_documented(store: ts.TileStore) -> None:
     assert all(c.unit and c.meaning and c.source for c in COLUMNS)
 
 
+def test_all_draws_may_be_in_other_streets_or_none(store: ts.TileStore) -> None:
+    rows = {
+        worlds: look(store, [PLACE], [0.1], seeing=SEEING.model_copy(update={"worlds": worlds}))
+        for worlds in (0, 1, 2)
+    }
+    for table in rows.values():
+        assert table["status"].tolist() == ["done"]
+        assert table["vd_draws"].tolist() == [2.0]
+    assert len({table["vd_near_along_along"][0] for table in rows.values()}) == 3
+    for name in ("ob_returns", "ob_score", "ob_info_along"):  # of the street as it was mapped
+        assert len({table[name][0] for table in rows.values()}) == 1
+    alone = look(store, [PLACE], [0.1], seeing=SEEING.model_copy(update={"draws": 1, "worlds": 0}))
+    assert math.isnan(alone["vd_mean_sd"][0])
+    assert alone["vd_mean"][0] > 0.0
+
+
+def test_a_draw_that_cannot_be_registered_is_left_out(
+    store: ts.TileStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A car that stands around the lidar leaves no scan; the other draw counts alone."""
+    empty = np.zeros((0, 3))
+    monkeypatch.setattr(sys.modules[observability.__module__], "scan_in_world", lambda *_: empty)
+    table = look(store, [PLACE], [0.1])
+    assert table["status"].tolist() == ["done"]
+    assert table["vd_draws"].tolist() == [1.0]
+    table = look(store, [PLACE], [0.1], seeing=SEEING.model_copy(update={"worlds": 2}))
+    assert table["status"].tolist() == ["failed"]
+    assert "0 points" in table["reason"][0]
+    assert math.isnan(table["vd_mean"][0])
+
+
 def test_neither_tiling_nor_company_nor_order_shows(street: Path, tmp_path: Path) -> None:
     places = np.array([[12.0, 0.5, 2.0], [20.0, 0.5, 2.0], [28.0, -1.0, 2.0]])
     headings = np.array([0.1, 0.0, 3.0])
@@ -345,5 +377,7 @@ def test_what_cannot_be_is_refused(store: ts.TileStore) -> None:
             look(store, places, headings)
     with pytest.raises(UsageError, match="cell_size"):
         look(store, [PLACE], [0.0], cell_size=3.0)
+    with pytest.raises(UsageError, match="worlds 3: give no more than draws, 2"):
+        VirtualSettings(draws=2, worlds=3)
     with pytest.raises(UsageError, match="did you mean range_max"):
         VirtualSettings(range_maxx=3.0)  # type: ignore[call-arg]

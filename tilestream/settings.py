@@ -242,7 +242,7 @@ class VirtualSettings(Settings):
     """Scans of the virtual drive at a place, each with other noise and other starts …"""
     worlds: Annotated[int, Field(ge=0)] = 2
     """… of which so many are taken in streets that are not as they were mapped: other cars, people,
-    leaves gone, motion, bias, returns lost."""
+    motion, bias, returns lost."""
     starts: Annotated[int, Field(ge=8)] | None = 32
     """Starts of each of them, spread over the disc of starts; null: all of them."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0

@@ -24,6 +24,12 @@ TRUCKS = 0.15
 """Share of the cars that are as large as a truck."""
 PERSON = (0.5, 0.5, 1.7)
 """Length, width and height [m]."""
+LANE = 3.3
+"""From lane to lane [m]."""
+APART = 8.0
+"""Room ahead of the vehicle and behind it in its own lane [m]."""
+WIDE = 0.3
+"""Share of the streets with a second lane in the direction of travel."""
 PASSED_BY = 0.4
 """Share of the balls that no beam meets: foliage, fences and the like are half transparent."""
 BIAS = 0.01
@@ -91,9 +97,9 @@ def world_at(dice: Dice, ground: float, rings: int, turn_s: float) -> World:
         [
             _parked(dice, side * near),
             _parked(dice, -side * far),
-            _driving(dice, 0.0, gap=8.0),
-            _driving(dice, -side * 3.3, gap=0.0),
-            _driving(dice, side * 3.3, gap=0.0)[: int(dice.uniform(1)[0] < 0.3) * 99],
+            _driving(dice, 0.0, APART),
+            _driving(dice, -side * LANE),
+            _driving(dice, side * LANE, share=WIDE),
         ]
     )
     large = dice.uniform(len(cars)) < TRUCKS
@@ -127,12 +133,13 @@ def _parked(dice: Dice, beside: float) -> Float64:
     return found
 
 
-def _driving(dice: Dice, beside: float, gap: float) -> Float64:
-    """(k, 2) cars in a lane, none nearer than a gap [m]."""
+def _driving(dice: Dice, beside: float, gap: float = 0.0, share: float = 1.0) -> Float64:
+    """(k, 2) cars in a lane that a share of the streets has, none nearer than a gap [m]."""
     count = int(dice.between(0.0, 5.0)[0])
     along = dice.between(-REACH, REACH, count)
     found = np.column_stack([along, beside + dice.normal(0.3, count)])
-    apart: Float64 = found[np.abs(along) >= gap + 0.5 * TRUCK[0]]
+    there = share == 1.0 or bool(dice.uniform(1)[0] < share)
+    apart: Float64 = found[(np.abs(along) >= gap + 0.5 * TRUCK[0]) & there]
     return apart
 
 

@@ -132,9 +132,10 @@ class Corrected(Regressor):
             raise ModelError("a damaged model file: no physics with a correction")
         physics = Physics.load(saved["physics"], target, factors, settings)
         trees, weight = saved["trees"], saved["weight"]
-        if not isinstance(weight, np.ndarray) or weight.tolist() not in [[0.0], *_EACH]:
+        known = [[share] for share in (0.0, *WEIGHTS)]
+        if not isinstance(weight, np.ndarray) or weight.tolist() not in known:
             raise ModelError("a damaged model file: its correction has no weight")
-        if not all(
+        if not isinstance(trees, list) or not all(
             isinstance(tree, DecisionTreeRegressor) and leads_somewhere(tree.tree_, len(factors))
             for tree in trees
         ):
@@ -144,9 +145,6 @@ class Corrected(Regressor):
 
     def _inputs(self, places: pd.DataFrame) -> Float32:
         return np.ascontiguousarray(matrix(places, self.factors), np.float32)
-
-
-_EACH = [[weight] for weight in WEIGHTS]
 
 
 def _boosted(
