@@ -4,6 +4,7 @@ python pipelines/retrain.py pipelines/retrain.yaml [--dry-run]
 
 Each run is the main job in a folder of its own: a call that was stopped continues when it is called
 again. The runs train no models of their own; the model over all of them is written at the end.
+--dry-run prints what each run costs and in all; it writes the presets of the lidars, no more.
 """
 
 import argparse
@@ -28,6 +29,8 @@ from tilestream.settings import VirtualSettings
 from tilestream.simulation.settings import load_preset
 
 MODEL = "model.skops"
+SIMULATION = ("survey", "scan", "log")
+"""Stages of a city, which its matchers share."""
 
 
 class Lidar(Settings):
@@ -152,11 +155,14 @@ def _core_hours(folder: str) -> float:
 
 
 def plan(wanted: Retraining) -> float:
-    """Print each run and its forecast; the sum [core-hours]."""
-    total = 0.0
+    """Print each run with its forecast, a city only once; the sum [core-hours]."""
+    total, cities = 0.0, set()
     for name, settings in runs_of(wanted):
         told = forecast(settings)
         hours = core_hours(told.tasks)
+        if settings.simulate.folder in cities:
+            hours = {stage: one for stage, one in hours.items() if stage not in SIMULATION}
+        cities.add(settings.simulate.folder)
         total += sum(hours.values())
         parts = ", ".join(f"{stage} {one:.3f}" for stage, one in hours.items() if one >= 0.001)
         print(f"{name}: {sum(hours.values()):.3f} core-hours ({parts})")

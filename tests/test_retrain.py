@@ -65,6 +65,16 @@ def test_a_dry_run_tells_what_it_costs_and_simulates_nothing(
     assert all(p.suffix == ".yaml" for p in (tmp_path / "cities").iterdir())
 
 
+def test_a_city_that_two_matchers_share_is_forecast_once(retrain: Any, tmp_path: Path) -> None:
+    few = {"size": "small", "presets": ["physical"], "seeds": [0]}
+    one, two = (
+        retrain.plan(wanted(retrain, tmp_path, **few, matchers=matchers))
+        for matchers in (["autoware"], ["autoware", "default"])
+    )
+    assert one > 0.0
+    assert two == pytest.approx(one)  # what comes after the simulation is not known before it
+
+
 def test_a_wrong_key_or_several_lidars_on_a_vehicle_are_refused(
     retrain: Any, tmp_path: Path
 ) -> None:
