@@ -154,9 +154,11 @@ def main(given: argparse.Namespace) -> None:
         [
             str(r.path) or "all",
             str(r.points),
-            f"{CM * r.level:.0f} %",
-            f"{CM * r.covered:.0f} %",
-            f"{CM * r.width:.1f}",
+            *(
+                ["none: no two blocks elsewhere", "", ""]
+                if pd.isna(r.level)
+                else [f"{CM * r.level:.0f} %", f"{CM * r.covered:.0f} %", f"{CM * r.width:.1f}"]
+            ),
         ]
         for r in coverage.itertuples()
     ]

@@ -2,15 +2,12 @@
 
     python benchmarks/virtual_drive.py cost [--tiles 1 4 9]
     python benchmarks/virtual_drive.py city RUN [--every 10] [--set without_ghosts=false]
-    python benchmarks/virtual_drive.py sensors RUN [--set ...]
 
 cost: CPU time of one core per sample point, on street tiles of a million points, VLP-16, 100 m, and
 per tile of larger cities. city: RUN is what `tilestream run pipelines/shinjuku.yaml` made; at every
 n-th sample point the virtual scan is held against the simulator's own scan, by range, and the
 virtual drive against the measured errors, beside two ceilings: the scans themselves from as few
-starts, and a repeated drive. sensors: RUN is what `tilestream run pipelines/drive.yaml` made; each
-lidar's own virtual drive is held against the errors measured as if with it. Nothing is written into
-RUN.
+starts, and a repeated drive. Nothing is written into RUN.
 """
 
 import argparse
@@ -28,9 +25,8 @@ def options() -> argparse.Namespace:
     cost_of.add_argument("--spacing", type=float, default=0.13, help="of the surfaces [m]")
     city_of = parts.add_parser("city", help="against the errors of a simulated city")
     city_of.add_argument("--every", type=int, default=10, help="use each n-th sample point")
-    for part in (city_of, parts.add_parser("sensors", help="over the lidars of a real drive")):
-        part.add_argument("run", type=Path, help="a finished run directory")
-        part.add_argument("--set", action="append", default=[], help="of the virtual drive")
+    city_of.add_argument("run", type=Path, help="a finished run directory")
+    city_of.add_argument("--set", action="append", default=[], help="of the virtual drive")
     return parser.parse_args()
 
 
@@ -69,7 +65,7 @@ from tilestream.kernels.virtual_scan import cast
 from tilestream.local_map import LocalCells
 from tilestream.pipeline.jobs.along_routes import observe_along
 from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
-from tilestream.settings import DriveSettings, VirtualSettings
+from tilestream.settings import VirtualSettings
 
 BINS = (0.0, 5.0, 10.0, 20.0, 30.0, 50.0, 100.0)
 """Ranges by which scans are compared [m]."""
@@ -197,7 +193,9 @@ def cost_of_cities(folder: Path, sizes: list[int], spacing: float) -> pd.DataFra
 
 def errors_of(run: Path, group: str) -> pd.DataFrame:
     """The measured errors of a drive, by sample point; those that are done."""
-    parts = [pd.read_parquet(path) for path in sorted((run / "tables/errors" / group).iterdir())]
+    parts = [
+        pd.read_parquet(path) for path in sorted((run / "tables/errors" / group).glob("*.parquet"))
+    ]
     table = pd.concat(parts)
     return table[table["status"] == "done"].set_index("sample", drop=False).sort_index()
 
@@ -208,7 +206,8 @@ def city(run: Path, every: int, changes: dict[str, Any]) -> None:
     assert settings.simulate is not None
     assert settings.observe is not None
     seeing = VirtualSettings(**(settings.observe.model_dump() | changes))
-    store, logs = ts.open_store(str(run / "map.zarr")), Path(settings.simulate.folder) / "logs"
+    store = ts.open_store(str(run / "map.zarr"))
+    logs = Path(settings.simulate.folder or run / "simulation") / "logs"
     tables, ranges, spent = [], [], 0.0
     for group in sorted(path.name for path in (run / "tables/errors").glob("drive0-*")):
         labels = errors_of(run, group)
@@ -324,48 +323,6 @@ def against(table: pd.DataFrame, estimates: dict[str, dict[str, str]]) -> pd.Dat
     return pd.DataFrame(rows, columns=names)
 
 
-# --- 3. The real drive, over sensors
-
-
-def sensor_of(drive: DriveSettings) -> tuple[ts.Sensor, dict[str, Any]]:
-    """The HDL-64E of the drive as the run thinned it, and how the vehicle sees with it."""
-    full = np.array(ts.HDL64.elevations_deg)
-    kept = full if drive.beams is None else np.linspace(full[0], full[-1], drive.beams)
-    sensor = ts.HDL64.model_copy(update={"elevations_deg": tuple(kept.tolist())})
-    return sensor, {
-        "range_max": drive.range_max or 80.0,
-        "blind_rear_deg": drive.blind_rear_deg or 0.0,
-    }
-
-
-def sensors(run: Path, changes: dict[str, Any]) -> None:
-    """The virtual drive of each sensor beside what was measured as if with it."""
-    settings = read_settings(run / "config.yaml")
-    store = ts.open_store(str(run / "map.zarr"))
-    rows, scans = [], []
-    for drive in settings.drives:
-        labels = errors_of(run, drive.group)
-        places, headings = labels[["x", "y", "z"]].to_numpy(), labels["heading"].to_numpy()
-        sensor, seen = sensor_of(drive)
-        seeing = VirtualSettings(**(seen | changes))
-        found = observability(store, places, headings, sensor, seeing, settings.label.registration)
-        done = (found["status"] == "done").to_numpy()
-        y, x = labels["error_mean"].to_numpy()[done], found["vd_mean"].to_numpy()[done]
-        scans.append(pd.DataFrame({"scan": labels["scan"].to_numpy()[done], "x": x, "y": y}))
-        means = [f"{100 * value:.1f}" for value in (y.mean(), x.mean())]
-        rows.append((drive.group, len(y), *means, f"{spearmanr(x, y)[0]:.2f}", (~done).sum()))
-    names = ["sensor", "scans", "measured [cm]", "virtual [cm]", "Spearman", "not done"]
-    show("Over sensors", pd.DataFrame(rows, columns=names))
-    together = pd.concat(scans)
-    same = together.groupby("scan").filter(lambda rows: len(rows) == len(settings.drives))
-    order = np.array([spearmanr(g["x"], g["y"])[0] for _, g in same.groupby("scan")])
-    print(
-        f"\nall {len(together)} scans: Spearman {spearmanr(together['x'], together['y'])[0]:.2f}; "
-        f"order of the sensors at {len(order)} places: mean Spearman {order.mean():.2f}, "
-        f"right at {(order > 0.999).sum()}"
-    )
-
-
 def changed(settings: list[str]) -> dict[str, Any]:
     """Settings of the virtual drive, from `key=value`."""
     return {key: yaml.safe_load(value) for key, value in (s.split("=", 1) for s in settings)}
@@ -375,8 +332,6 @@ def main(given: argparse.Namespace) -> None:
     """Measure what is asked for."""
     if given.part == "city":
         city(given.run, given.every, changed(given.set))
-    elif given.part == "sensors":
-        sensors(given.run, changed(given.set))
     else:
         with tempfile.TemporaryDirectory() as scratch:
             show("Per sample point", cost(Path(scratch) / "street", given.spacing))

@@ -49,7 +49,6 @@ OF_A_FINISHED_RUN = (
     "experiment.py city",
     "predict.py --run city",
     "virtual_drive.py city city --every 20",
-    "virtual_drive.py sensors drive",
 )
 
 
