@@ -101,7 +101,7 @@ def spots(city: City, path: Path) -> None:
     )
     for (title, name, point), (wide, above, mapped) in zip(PLACES, axes, strict=True):
         street = city.street(name)
-        scan = next(iter(scans(city, street, (point, point + 1))))
+        scan = next(iter(scans(city, street, range(point, point + 1))))
         assert scan.T_map_lidar is not None
         assert scan.ring is not None
         azimuth = np.rad2deg(np.arctan2(scan.points[:, 1], scan.points[:, 0]))

@@ -44,7 +44,7 @@ def main(given: argparse.Namespace) -> None:
         triangles = len(city.scene(street.xy[slice(*span)], 0))
         seconds["scene"].append(time.perf_counter() - began)
         began = time.perf_counter()
-        returns = [len(scan.points) for scan in scans(city, street, span)]
+        returns = [len(scan.points) for scan in scans(city, street, range(*span))]
         seconds["scans"].append(time.perf_counter() - began)
         began = time.perf_counter()
         points = len(survey(city, street, span, 0))

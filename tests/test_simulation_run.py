@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import yaml
 from killed import killed_after
+from scipy.spatial import cKDTree
 
 import tilestream as ts
 from tilestream.cli import run
@@ -179,7 +180,7 @@ def test_another_drive_adds_its_log_and_leaves_the_rest(
 
 def scan_of(city: City, settings: SimulationSettings, point: int = 30) -> Scan:
     other = replace(city, settings=settings)
-    return next(iter(scans(other, city.street("A"), (point, point + 1))))
+    return next(iter(scans(other, city.street("A"), range(point, point + 1))))
 
 
 def by_ray(scan: Scan) -> dict[tuple[int, float], np.ndarray]:
@@ -271,6 +272,65 @@ def test_drift_shifts_the_points_of_a_place_and_draws_no_others(
         assert np.ptp(shift, axis=0).max() < 0.0011  # one millimetre of rounding
 
 
+# --- Fewer scans, and the survey of another simulation
+
+
+def test_every_third_point_gives_the_same_scans_where_it_is_scanned(
+    settings: SimulationSettings, made: Path, tmp_path: Path
+) -> None:
+    """But for single rays whose range is on the edge of two steps: the stretch from 50 on begins
+    between two scans, so its scene has another origin.
+    """
+    few = simulate(settings, tmp_path / "few", every=3, survey_of=made)
+    one, other = (open_log(folder / "logs/drive0/A.mcap") for folder in (made, few))
+    assert len(one) == A
+    assert other.stamps_ns.tolist() == one.stamps_ns[::3].tolist()
+    scans = zip(one.scans_at(range(0, A, 3)), other.scans_at(range(len(other))), strict=True)
+    for a, b in scans:
+        assert abs(len(a.points) - len(b.points)) < 0.002 * len(a.points)
+        away, _ = cKDTree(a.points).query(b.points)
+        assert (away > 1e-4).mean() < 0.002
+    assert not list((few / "survey").iterdir())
+
+
+def test_more_metres_between_scans_than_a_stretch_has(
+    settings: SimulationSettings, made: Path, tmp_path: Path
+) -> None:
+    few = simulate(settings, tmp_path / "few", every=60, survey_of=made)
+    assert len(open_log(few / "logs/drive0/A.mcap")) == 2
+
+
+def test_another_lidar_drives_in_the_survey_of_the_first(
+    settings: SimulationSettings, made: Path, tmp_path: Path
+) -> None:
+    before = files(made)
+    lidar = {"sensor": ts.VLP16.with_beams(4), "range_max": 20.0}
+    other = changed(settings, "lidar", **lidar)
+    lesser = simulate(other, tmp_path / "lesser", every=10, survey_of=made)
+    scan = next(iter(open_log(lesser / "logs/drive0/A.mcap").scans_at([0])))
+    assert len(np.unique(scan.ring)) <= 4
+    assert np.linalg.norm(scan.points, axis=1).max() < 20.5
+    assert files(made) == before
+
+
+def test_a_survey_of_another_city_or_of_half_of_it_is_refused(
+    settings: SimulationSettings, made: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(UsageError, match="no simulation is there"):
+        simulate(settings, tmp_path / "a", survey_of=tmp_path)
+    with pytest.raises(UsageError, match="another city, with seed 0"):
+        simulate(settings.model_copy(update={"seed": 1}), tmp_path / "a", survey_of=made)
+    thin = changed(settings, "survey", rays_per_m=1000)
+    with pytest.raises(UsageError, match="another city, with survey"):
+        simulate(thin, tmp_path / "a", survey_of=made)
+    half = tmp_path / "half"
+    shutil.copytree(made, half)
+    (half / "survey" / "A_1_00050.laz").unlink()
+    with pytest.raises(UsageError, match=r"1 of 6 blocks.*A-1-50"):
+        simulate(settings, tmp_path / "a", survey_of=half)
+    assert not (tmp_path / "a").exists()
+
+
 # --- The plan
 
 
@@ -301,6 +361,11 @@ def test_the_plan_is_made_without_building_or_writing_anything(
 def test_turns_per_point_are_bounded(settings: SimulationSettings, count: int) -> None:
     with pytest.raises(UsageError, match="give 1 to 64"):
         plan_simulation(settings, "out", scans_per_point=count)
+
+
+def test_every_is_a_count(settings: SimulationSettings) -> None:
+    with pytest.raises(UsageError, match="give 1 or more"):
+        plan_simulation(settings, "out", every=0)
 
 
 # --- Refusals

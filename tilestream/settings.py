@@ -280,8 +280,9 @@ class LabelSettings(Settings):
 class SimulateSettings(Settings):
     """A simulated city instead of real files: its survey is the map, its drives are measured."""
 
-    city: Literal["shinjuku"] = "shinjuku"
-    """The city that ships with tilestream."""
+    city: Literal["shinjuku", "sendagaya"] = "shinjuku"
+    """A district that ships with tilestream: `shinjuku` has the paper's five paths, `sendagaya`
+    three streets of another one."""
     preset: str = "physical"
     """`physical`, `paper`, or a YAML file of simulation settings."""
     size: Literal["full", "small"] = "full"
@@ -292,6 +293,10 @@ class SimulateSettings(Settings):
     """Only these streets; not given: all."""
     scans_per_point: Annotated[int, Field(ge=1, le=64)] = 1
     """Turns of the lidar kept at each sample point."""
+    every: Annotated[int, Field(ge=1)] = 1
+    """Only each so-many-th sample point, of which there is one per metre, is scanned."""
+    survey_of: LocalFile | None = None
+    """The folder of a simulation of the same city: its survey is the map, none is simulated."""
     seed: int = 0
     """Seed of everything that is simulated."""
     folder: LocalFile | None = None

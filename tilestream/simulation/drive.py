@@ -93,27 +93,24 @@ def stamps_of(motion: Motion, settings: SimulationSettings, scans_per_point: int
     return begin + np.rint((motion.time[:, None] + turns) * 1e9).astype(np.int64)
 
 
-def scans(
-    city: City, street: Street, points: tuple[int, int], scans_per_point: int = 1
-) -> Iterator[Scan]:
+def scans(city: City, street: Street, points: range, scans_per_point: int = 1) -> Iterator[Scan]:
     """The scans at some sample points of a street, each with its true pose.
 
     Args:
         city: the city, with the settings of the drive.
         street: the street as it is driven (`driven_way`).
-        points: the first sample point and the one after the last.
+        points: of its sample points.
         scans_per_point: turns kept per sample point.
     """
     settings = city.settings
-    begin, end = points
     motion = motion_of(street, settings, settings.lidar.height)
     still = Scene(
-        city.scene(street.xy[begin:end], settings.drive + 1),
-        np.array([*street.xy[begin], 0.0]),
+        city.scene(street.xy[points.start : points.stop], settings.drive + 1),
+        np.array([*street.xy[points.start], 0.0]),
     )
     stamps = stamps_of(motion, settings, scans_per_point)
     traffic = traffic_of(street, settings, settings.drive + 1)
-    for point in range(begin, end):
+    for point in points:
         for turn in range(scans_per_point):
             stamp = int(stamps[point, turn])
             since = (stamp - stamps[0].mean()) / 1e9

@@ -4,7 +4,7 @@ import zlib
 from contextlib import nullcontext
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
 from pydantic import BeforeValidator, Field
@@ -14,6 +14,9 @@ from tilestream.config import Settings
 from tilestream.errors import SourceNotFoundError, UsageError
 from tilestream.files import local_path
 from tilestream.sensor import SENSORS, Sensor, Vehicle, named
+
+SHINJUKU = "shinjuku"
+"""The district that presets name, of the paper's five paths."""
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Length = Annotated[float, Field(ge=0.0)]
@@ -48,6 +51,11 @@ class CitySettings(Settings):
     """Share of the parking places along the curb that are taken."""
     slope: Length = 0.01
     """Steepest slope of the ground, m per m."""
+
+    def of_district(self, name: str) -> Self:
+        """The same in another district that ships with tilestream."""
+        files = {"footprints": f"{name}_buildings.geojson.gz", "routes": f"{name}_routes.geojson"}
+        return self.model_copy(update=files)
 
 
 class LidarSettings(Settings):

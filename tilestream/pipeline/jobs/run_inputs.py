@@ -34,7 +34,7 @@ from tilestream.settings import (
     SimulateSettings,
     VirtualSettings,
 )
-from tilestream.simulation.settings import SimulationSettings, load_preset
+from tilestream.simulation.settings import SHINJUKU, SimulationSettings, load_preset
 from tilestream.store import open_store
 
 JOB = "job"
@@ -87,7 +87,8 @@ def inputs_of(settings: RunSettings, client: Any | None, watch: Watch | None) ->
         if wanted.paths is None or log.stem in wanted.paths
     ]
     preset = load_preset(wanted.preset)
-    sources = settings.map.sources or (str(folder / "survey" / "*.laz"),)
+    surveyed = Path(wanted.survey_of) if wanted.survey_of else folder
+    sources = settings.map.sources or (str(surveyed / "survey" / "*.laz"),)
     files = settings.routes or (str(folder / "routes.geojson"),)
     read = _routes(files, settings, sources)
     if wanted.paths is not None and not settings.routes:
@@ -131,6 +132,8 @@ def _other_lidars(settings: RunSettings) -> list[str]:
 def simulations(wanted: SimulateSettings) -> list[SimulationSettings]:
     """The experiment of each drive."""
     preset = load_preset(wanted.preset).model_copy(update={"seed": wanted.seed})
+    if wanted.city != SHINJUKU:  # a preset of one's own may name other files
+        preset = preset.model_copy(update={"city": preset.city.of_district(wanted.city)})
     return [preset.model_copy(update={"drive": drive}) for drive in range(wanted.drives)]
 
 
@@ -139,6 +142,8 @@ def extent(wanted: SimulateSettings) -> dict[str, Any]:
     return {
         "paths": wanted.paths,
         "scans_per_point": wanted.scans_per_point,
+        "every": wanted.every,
+        "survey_of": wanted.survey_of,
         "size": wanted.size,
     }
 

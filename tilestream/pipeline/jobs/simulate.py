@@ -3,7 +3,7 @@
 import hashlib
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -25,6 +25,7 @@ from tilestream.pipeline.stages.simulated import (
     SurveyBlock,
     log,
     scan,
+    scanned,
     survey,
 )
 from tilestream.simulation.city import City, data_file, stretches
@@ -41,6 +42,8 @@ BYTES_PER_RAY, BYTES_PER_SCAN = 4, 400_000
 """On disk, generously: of a survey, and of a scan while it waits for its log [bytes]."""
 RECORD, ROUTES = "simulation.yaml", "routes.geojson"
 """Files that say what was simulated, and where its streets run."""
+OF_DRIVE = ("preset", "lidar", "odometry_error", "reverse", "side", "scans_per_point", "every")
+"""What of a simulation may differ from the one whose survey it uses."""
 SIMULATION_VERSION = 1
 """Raised when the code of the simulation changes what it writes."""
 
@@ -54,6 +57,8 @@ def simulate(
     *,
     paths: Sequence[str] | None = None,
     scans_per_point: int = 1,
+    every: int = 1,
+    survey_of: str | Path | None = None,
     size: Size = "full",
     client: Any | None = None,
     watch: Watch | None = None,
@@ -70,6 +75,9 @@ def simulate(
         out: the directory to write to.
         paths: the streets to simulate, by name; None: all, of which the driven ones are scanned.
         scans_per_point: turns of the lidar kept at each sample point.
+        every: only each so-many-th sample point is scanned.
+        survey_of: the directory of a simulation of the same city whose survey is the map of this
+            one too: then none is simulated. Its lidar, and how it drives, may differ.
         size: `small`: the first 40 m of each path and a thin survey, for demonstrations and tests.
         client: a Dask client to run on; None: this process.
         watch: is told of each task that ended.
@@ -78,19 +86,28 @@ def simulate(
         The directory.
 
     Raises:
-        UsageError: an unknown path, a route through a building, or a directory that holds another
-            simulation.
+        UsageError: an unknown path, a route through a building, a directory that holds another
+            simulation, or a survey of another city or of fewer of its streets.
         PlanError: not enough space on the disk.
         LockedError: another process writes to the directory.
         PartialError: some tasks failed; the message lists them, the rest is there.
     """
     folder = Path(place_of(local_path(out)))
     plan = plan_simulation(
-        settings, folder, paths=paths, scans_per_point=scans_per_point, size=size
+        settings,
+        folder,
+        paths=paths,
+        scans_per_point=scans_per_point,
+        every=every,
+        survey_of=survey_of,
+        size=size,
     )
     settings = _sized(settings, size)
-    identity = _identity(settings, scans_per_point, size)
+    identity = _identity(settings, scans_per_point, every, size)
     _require_same(folder, identity)
+    if survey_of is not None:
+        surveyed = Path(place_of(local_path(survey_of)))
+        _require_surveyed(surveyed, identity, _surveys(settings, surveyed, paths, size))
     require_space(folder, _bytes_needed(plan))
     city = SimulatedCity(settings.model_dump_json()).read()
     for street in city.streets:
@@ -114,6 +131,8 @@ def plan_simulation(
     *,
     paths: Sequence[str] | None = None,
     scans_per_point: int = 1,
+    every: int = 1,
+    survey_of: str | Path | None = None,
     size: Size = "full",
 ) -> Plan:
     """What `simulate` will run: surveys and scans of every stretch, then a log per driven street.
@@ -123,23 +142,42 @@ def plan_simulation(
     """
     if scans_per_point < 1 or scans_per_point > 64:
         raise UsageError(f"scans_per_point is {scans_per_point}: give 1 to 64")
+    if every < 1:
+        raise UsageError(f"every is {every}: give 1 or more")
     folder, settings = Path(place_of(local_path(out))), _sized(settings, size)
-    city = SimulatedCity(settings.model_dump_json())
-    streets = read_streets(data_file(settings.city.routes))
-    if paths is not None:
-        streets = tuple(street_called(streets, name) for name in paths)
-    tasks: list[Task] = []
+    tasks = [] if survey_of is not None else _surveys(settings, folder, paths, size)
     logs: list[Task] = []
-    for street in streets:
-        end = len(street.xy) if size == "full" else min(len(street.xy), SMALL_POINTS)
-        pieces = [(b, min(e, end)) for b, e in stretches(street, STRETCH) if b < end]
-        for passes in range(settings.survey.passes):
-            tasks += [_survey(city, settings, folder, street, piece, passes) for piece in pieces]
-        drive = _drive(city, settings, folder, street, pieces, scans_per_point)
+    for street, pieces in _pieces(settings, paths, size):
+        drive = _drive(settings, folder, street, pieces, (scans_per_point, every))
         tasks += drive[:-1]
         logs += drive[-1:]
     largest = max((task.promised_bytes for task in (*tasks, *logs)), default=0)
     return Plan.of((*tasks, *logs), largest)
+
+
+def _pieces(
+    settings: SimulationSettings, paths: Sequence[str] | None, size: Size
+) -> Iterator[tuple[Street, list[tuple[int, int]]]]:
+    """The streets that are simulated, each in stretches."""
+    streets = read_streets(data_file(settings.city.routes))
+    if paths is not None:
+        streets = tuple(street_called(streets, name) for name in paths)
+    for street in streets:
+        end = len(street.xy) if size == "full" else min(len(street.xy), SMALL_POINTS)
+        yield street, [(b, min(e, end)) for b, e in stretches(street, STRETCH) if b < end]
+
+
+def _surveys(
+    settings: SimulationSettings, folder: Path, paths: Sequence[str] | None, size: Size
+) -> list[Task]:
+    """Every pass of the survey along every stretch."""
+    city = SimulatedCity(settings.model_dump_json())
+    return [
+        _survey(city, settings, folder, street, piece, passes)
+        for street, pieces in _pieces(settings, paths, size)
+        for passes in range(settings.survey.passes)
+        for piece in pieces
+    ]
 
 
 def _survey(
@@ -164,18 +202,27 @@ def _survey(
 
 
 def _drive(
-    city: SimulatedCity,
     settings: SimulationSettings,
     folder: Path,
     street: Street,
     pieces: Sequence[tuple[int, int]],
-    scans_per_point: int,
+    turns: tuple[int, int],
 ) -> list[Task]:
-    """The scans of a drive along a street, then its log; nothing where that is there."""
+    """The scans of a drive along a street, then its log; nothing where that is there.
+
+    Args:
+        settings: the experiment.
+        folder: where all is.
+        street: the street.
+        pieces: its stretches.
+        turns: how many are kept at a sample point, and at each how-many-th one.
+    """
+    scans_per_point, every = turns
     path = folder / "logs" / f"drive{settings.drive}" / f"{street.name}.mcap"
     if not street.driven or path.exists():
         return []
-    takes = {"street": street.name, "scans_per_point": scans_per_point}
+    city = SimulatedCity(settings.model_dump_json())
+    takes = {"street": street.name, "scans_per_point": scans_per_point, "every": every}
     if settings.reverse:
         last = len(street.xy)
         pieces = [(last - end, last - begin) for begin, end in reversed(pieces)]
@@ -188,10 +235,11 @@ def _drive(
             ),
             takes={**takes, "stretch": (begin, end)},
             reads={"city": city},
-            work=end - begin,
-            counts={"scans": (end - begin) * scans_per_point},
+            work=len(scanned((begin, end), every)),
+            counts={"scans": len(scanned((begin, end), every)) * scans_per_point},
         )
         for begin, end in pieces
+        if scanned((begin, end), every)
     ]
     stretch = pieces[0][0], pieces[-1][1]
     log_task = Task(
@@ -200,7 +248,7 @@ def _drive(
         DriveLog(str(path)),
         takes={**takes, "stretch": stretch},
         reads={"city": city, "parts": tuple(part.product for part in parts)},
-        work=stretch[1] - stretch[0],
+        work=len(scanned(stretch, every)),
     )
     return [*parts, log_task]
 
@@ -235,7 +283,9 @@ def _sized(settings: SimulationSettings, size: Size) -> SimulationSettings:
     return settings.model_copy(update={"survey": thin})
 
 
-def _identity(settings: SimulationSettings, scans_per_point: int, size: Size) -> dict[str, Any]:
+def _identity(
+    settings: SimulationSettings, scans_per_point: int, every: int, size: Size
+) -> dict[str, Any]:
     """All that decides what the files of a simulation hold, whatever their drive."""
     inputs = {
         name: hashlib.sha256(data_file(name).read_bytes()).hexdigest()
@@ -244,6 +294,7 @@ def _identity(settings: SimulationSettings, scans_per_point: int, size: Size) ->
     return {
         "settings": settings.model_dump(mode="json", exclude={"drive", "note"}),
         "scans_per_point": scans_per_point,
+        "every": every,
         "size": size,
         "inputs_sha256": inputs,
         "tilestream": VERSION,
@@ -260,15 +311,53 @@ def _require_same(folder: Path, identity: dict[str, Any]) -> None:
     record = folder / RECORD
     if not record.exists():
         return
-    known = read_yaml(record, UsageError)
-    if not isinstance(known, dict):
-        raise UsageError(f"{record} is no record of a simulation: give another directory")
+    known = _record(record)
     there = {name: known.get(name) for name in identity}
     other = [f"{name} {there[name]}" for name in identity if there[name] != identity[name]]
     if other:
         raise UsageError(
             f"{folder} holds another simulation, with {'; '.join(other)} ({record}): give another "
             "directory"
+        )
+
+
+def _record(path: Path) -> dict[str, Any]:
+    """What was simulated beside it.
+
+    Raises:
+        UsageError: it is no record.
+    """
+    known = read_yaml(path, UsageError)
+    if not isinstance(known, dict) or not isinstance(known.get("settings"), dict):
+        raise UsageError(f"{path} is no record of a simulation: give another directory")
+    return known
+
+
+def _require_surveyed(folder: Path, identity: dict[str, Any], surveys: Sequence[Task]) -> None:
+    """Refuse a survey that is not of the same city, or not whole.
+
+    Raises:
+        UsageError: names what differs, or how much is missing.
+    """
+    record = folder / RECORD
+    if not record.exists():
+        raise UsageError(f"{folder}: no simulation is there: give one whose survey is to be used")
+    known = _record(record)
+    same = [name for name in identity if name not in ("settings", *OF_DRIVE)]
+    settings, there = identity["settings"], known["settings"]
+    other = [f"{name} {known.get(name)}" for name in same if known.get(name) != identity[name]]
+    other += [
+        f"{name} {there.get(name)}"
+        for name in settings
+        if name not in OF_DRIVE and there.get(name) != settings[name]
+    ]
+    if other:
+        raise UsageError(f"{folder} has the survey of another city, with {'; '.join(other)}")
+    missing = [task.key for task in surveys if task.writes.known(task.identity) is None]
+    if missing:
+        raise UsageError(
+            f"{folder}: {len(missing)} of {len(surveys)} blocks of its survey are not there, the "
+            f"first {missing[0]}: simulate it first, with these paths"
         )
 
 

@@ -136,10 +136,18 @@ def survey(city: City, street: str, stretch: tuple[int, int], passes: int) -> An
 
 
 @stage("scan", version=1, memory=lambda _: SCENE_BYTES, seconds=0.03)
-def scan(city: City, street: str, stretch: tuple[int, int], scans_per_point: int) -> Iterable[Scan]:
+def scan(
+    city: City, street: str, stretch: tuple[int, int], scans_per_point: int, every: int
+) -> Iterable[Scan]:
     """The scans of a drive along a stretch of a street, from where it begins."""
     way = driven_way(city.street(street), city.settings)
-    return scans_of(city, way, stretch, scans_per_point)
+    return scans_of(city, way, scanned(stretch, every), scans_per_point)
+
+
+def scanned(stretch: tuple[int, int], every: int) -> range:
+    """The sample points of a stretch that are scanned: those whose number `every` divides."""
+    begin, end = stretch
+    return range(-(-begin // every) * every, end, every)
 
 
 @stage("log", version=2, memory=lambda _: SCENE_BYTES, seconds=0.02)
@@ -149,6 +157,7 @@ def log(
     street: str,
     stretch: tuple[int, int],
     scans_per_point: int,
+    every: int,
 ) -> Made:
     """All scans of a drive along a stretch of a street, its odometry and its truth."""
     settings = city.settings
@@ -156,14 +165,14 @@ def log(
     motion = motion_of(driven, settings, settings.lidar.height)
     stamps = stamps_of(motion, settings, scans_per_point)
     origin = round(stamps[0].mean())
-    seen = stamps[slice(*stretch)].ravel()
-    every = np.arange(seen[0], seen[-1] + 2 * POSE_NS, POSE_NS)
+    seen = stamps[scanned(stretch, every)].ravel()
+    regular = np.arange(seen[0], seen[-1] + 2 * POSE_NS, POSE_NS)
     # The truth also has a pose at each scan and half-way: more than the odometry, so readers that
     # are told no topic take it.
-    often = np.unique(np.concatenate([seen, every, every[:-1] + POSE_NS // 2]))
+    often = np.unique(np.concatenate([seen, regular, regular[:-1] + POSE_NS // 2]))
     believed, truth = (
         Trajectory(times, motion.pose(city.ground, motion.arc_at((times - origin) / 1e9)), "lidar")
-        for times in (every, often)
+        for times in (regular, often)
     )
     scans = (scan for part in parts for scan in part)
     return Made((scans, odometry(city, believed, driven), truth), {"scans": len(seen)})
