@@ -3,18 +3,20 @@
 python pipelines/retrain.py pipelines/retrain.yaml [--dry-run]
 
 Each run is the main job in a folder of its own: a call that was stopped continues when it is called
-again. The runs train no models of their own; the model over all of them is written at the end.
+again. The runs train no models of their own; the model over all of them is judged on streets,
+lidars and districts that are held out, and written with its card at the end.
 --dry-run prints what each run costs and in all; it writes the presets of the lidars, no more.
 """
 
 import argparse
+import itertools
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import yaml
-from pydantic import Field
+from pydantic import Field, model_validator
 
 import tilestream as ts
 from tilestream.bounded_yaml import read_yaml
@@ -26,6 +28,7 @@ from tilestream.pipeline.jobs.forecast import forecast
 from tilestream.pipeline.jobs.run_settings import Recipe
 from tilestream.sensor import Sensor, Vehicle, sensor_of
 from tilestream.settings import VirtualSettings
+from tilestream.simulation.city import data_file
 from tilestream.simulation.settings import load_preset
 
 MODEL = "model.skops"
@@ -60,6 +63,24 @@ class Lidar(Settings):
         return found if self.beams is None else found.with_beams(self.beams)
 
 
+class Share(Settings):
+    """A share of the runs: each of its presets x seeds x lidars x matchers is one."""
+
+    city: str = "shinjuku"
+    """The district."""
+    paths: tuple[str, ...] | None = None
+    """Only these of its streets; not given: all."""
+    presets: Annotated[tuple[str, ...], Field(min_length=1)] = ("physical", "paper")
+    seeds: Annotated[tuple[int, ...], Field(min_length=1)] = (0,)
+    lidars: Annotated[tuple[str, ...], Field(min_length=1)]
+    """By name."""
+    matchers: Annotated[tuple[str, ...], Field(min_length=1)] = ("autoware",)
+    spacing: Annotated[int, Field(ge=1)] = 5
+    """Between measured places [m]."""
+    drives: int = 1
+    """Of each path."""
+
+
 class Retraining(Settings):
     """What is simulated, measured and trained over."""
 
@@ -67,32 +88,57 @@ class Retraining(Settings):
     """Where all of it goes."""
     lidars: Annotated[dict[str, Lidar], Field(min_length=1)]
     """By name."""
-    presets: Annotated[tuple[str, ...], Field(min_length=1)] = ("physical", "paper")
-    seeds: Annotated[tuple[int, ...], Field(min_length=1)] = (0,)
-    matchers: Annotated[tuple[str, ...], Field(min_length=1)] = ("autoware",)
+    shares: Annotated[tuple[Share, ...], Field(min_length=1)]
+    """What is run."""
     recipe: Recipe = "corrected"
     seed: int = 0
-    spacing: Annotated[float, Field(gt=0.0)] = 5.0
+    """Of the training."""
     size: str = "full"
-    drives: int = 1
-    paths: tuple[str, ...] | None = None
+    """`small`: 40 m of each path, to try it."""
     observe: VirtualSettings = VirtualSettings()
+    """How the virtual drive is drawn: the same for all."""
+
+    @model_validator(mode="after")
+    def _named(self) -> Self:
+        unknown = {name for share in self.shares for name in share.lidars} - set(self.lidars)
+        if unknown:
+            raise ValueError(f"has a share of {', '.join(sorted(unknown))}, and no such lidar")
+        return self
 
 
 def runs_of(wanted: Retraining) -> Iterator[tuple[str, ts.RunSettings]]:
-    """The runs by name; the preset of each city, with its lidar, is written beside it."""
-    for preset in wanted.presets:
-        for seed in wanted.seeds:
-            for name, lidar in wanted.lidars.items():
-                city = f"{wanted.out}/cities/{Path(preset).stem}-{seed}-{name}"
-                file = f"{city}.yaml"
-                _write_preset(preset, lidar, file)
-                for matcher in wanted.matchers:
-                    run = f"{Path(preset).stem}-{seed}-{name}-{Path(matcher).stem}"
-                    yield run, _run(wanted, lidar, run, matcher, (file, seed, city))
+    """The runs by name, none twice; the preset of each lidar is written.
+
+    Runs of one city, preset and seed share its survey, which the first of them simulates, and its
+    map. None estimates along a route: two places of one stand for all.
+    """
+    surveyed: dict[str, str] = {}
+    seen: set[str] = set()
+    for share in wanted.shares:
+        for preset, seed in itertools.product(share.presets, share.seeds):
+            city = f"{wanted.out}/cities/{share.city}-{Path(preset).stem}-{seed}"
+            for lidar, matcher in itertools.product(share.lidars, share.matchers):
+                drive = f"{city}-{lidar}-{share.spacing}m"
+                name = f"{Path(drive).name}-{Path(matcher).stem}"
+                if name in seen:
+                    raise UsageError(f"run {name} is in two shares: leave it out of one")
+                seen.add(name)
+                first = surveyed.setdefault(city, drive)
+                simulate = {
+                    "city": share.city,
+                    "preset": _write_preset(preset, wanted.lidars[lidar], f"{drive}.yaml"),
+                    "size": wanted.size,
+                    "drives": share.drives,
+                    "paths": share.paths,
+                    "every": share.spacing,
+                    "seed": seed,
+                    "folder": drive,
+                    "survey_of": None if first == drive else first,
+                }
+                yield name, _run(wanted, wanted.lidars[lidar], name, matcher, simulate, city)
 
 
-def _write_preset(preset: str, lidar: Lidar, file: str) -> None:
+def _write_preset(preset: str, lidar: Lidar, file: str) -> str:
     known = load_preset(preset)
     carried = known.lidar.model_copy(
         update={
@@ -105,30 +151,34 @@ def _write_preset(preset: str, lidar: Lidar, file: str) -> None:
     values = known.model_copy(update={"lidar": carried}).model_dump(mode="json")
     Path(file).parent.mkdir(parents=True, exist_ok=True)
     Path(file).write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
+    return file
 
 
 def _run(
-    wanted: Retraining, lidar: Lidar, name: str, matcher: str, city: tuple[str, int, str]
+    wanted: Retraining, lidar: Lidar, name: str, matcher: str, simulate: dict[str, Any], city: str
 ) -> ts.RunSettings:
-    preset, seed, folder = city
     seeing = {"range_max": lidar.range_max, "blind_rear_deg": lidar.blind_rear_deg}
     return ts.RunSettings(
         out=f"{wanted.out}/runs/{name}",
-        simulate={
-            "preset": preset,
-            "size": wanted.size,
-            "drives": wanted.drives,
-            "paths": wanted.paths,
-            "seed": seed,
-            "folder": folder,
-        },
-        spacing=wanted.spacing,
+        simulate=simulate,
+        map={"store": f"{city}/map.zarr"},
+        routes=(_two_places(simulate["city"], simulate["every"], f"{simulate['folder']}.geojson"),),
+        spacing=float(simulate["every"]),
+        memory="2GB",
         sensor=lidar.model,
         sensor_height=lidar.height,
         observe=wanted.observe.model_copy(update=seeing),
         label={"matcher": matcher},
         model={"recipe": "physics", "offset": 0.0},  # nothing is trained of one run alone
     )
+
+
+def _two_places(city: str, spacing: int, file: str) -> str:
+    routes = json.loads(data_file(f"{city}_routes.geojson").read_text(encoding="utf-8"))
+    first = routes["features"][0]
+    first["geometry"]["coordinates"] = first["geometry"]["coordinates"][: spacing + 2]
+    Path(file).write_text(json.dumps(routes | {"features": [first]}), encoding="utf-8")
+    return file
 
 
 def retrain(wanted: Retraining) -> str:
@@ -140,9 +190,14 @@ def retrain(wanted: Retraining) -> str:
         names.append(name)
     folders = {name: f"{wanted.out}/runs/{name}" for name in names}
     path = f"{wanted.out}/{MODEL}"
-    model = ts.train_over(folders, recipe=wanted.recipe, seed=wanted.seed, out=path)
+    model = ts.train_over(folders, recipe=wanted.recipe, seed=wanted.seed, judge=True, out=path)
     for lidar in model.card["lidars"]:
         print(f"trained over {lidar}")
+    for name, told in model.card["checked"].items():
+        low, high = told["skill"][1:]
+        print(
+            f"{name}: {told['places']} places, skill {told['skill'][0]:.2f} ({low:.2f}-{high:.2f})"
+        )
     spent = sum(_core_hours(folder) for folder in folders.values())
     print(f"{model.card['places']} places, {spent:.3f} core-hours without the simulation: {path}")
     return path

@@ -1,5 +1,6 @@
 """One model over several runs: what may differ between them, what must not, what its card says."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,13 @@ import pytest
 import tilestream as ts
 from tilestream.errors import ModelError, UsageError
 from tilestream.matcher import MATCHERS
+from tilestream.model.card import card_told
+from tilestream.model.checked import checked_of
 from tilestream.model.dataset import Dataset, made_with
+from tilestream.model.domain import WIDEST
 from tilestream.model.evaluation import cross_validate
-from tilestream.model.file import load_model
+from tilestream.model.figures import figures_of
+from tilestream.model.file import load_model, save_model
 from tilestream.model.making import inputs_of
 from tilestream.model.over_runs import Run, over_runs
 from tilestream.model.splits import BUFFER, OVER_RUNS, PROTOCOLS, leave_path_out, protocols_of
@@ -186,6 +191,54 @@ def test_inside_of_the_card_nothing_happens_outside_it_is_flagged_with_its_range
     assert found["reason"].str.contains("range_m 20, trained over 30 to 100", regex=False).all()
     outside = [one.name for one in check_making(model, making(ts.OS1_128))]
     assert "beams" in outside
+
+
+def test_outside_of_the_card_intervals_are_as_wide_as_held_out_lidars_need(
+    model: Any, runs: dict[str, Dataset], tmp_path: Path
+) -> None:
+    assert 1.0 <= model.card["wider_outside"] <= WIDEST
+    harder = replace(model, card={**model.card, "wider_outside": 2.0})
+    save_model(harder, tmp_path / "m.skops")
+    places = runs["vlp"].averaged(model.width).rows
+    plain = predict(model, places)
+    found = predict(load_model(tmp_path / "m.skops"), places, making(range_max=20.0))
+    grown = (found["high"] - found["estimate"]) / (plain["high"] - plain["estimate"])
+    assert grown.to_numpy() == pytest.approx(2.0)
+    assert (found["low"] <= plain["low"]).all()
+    assert found["reason"].str.contains("its interval 2 times wider", regex=False).all()
+
+
+def test_a_lidar_unlike_all_others_asks_for_wider_intervals(runs: dict[str, Dataset]) -> None:
+    """The same labels, but of one lidar twice what its virtual drive says."""
+    rows = runs["hdl"].rows
+    twice = replace(runs["hdl"], rows=rows.assign(error_mean=2.0 * rows["error_mean"]))
+    alike = ts.train_over(runs, recipe="physics").wider_outside
+    unlike = ts.train_over({**runs, "hdl": twice}, recipe="physics").wider_outside
+    assert unlike > alike
+
+
+def test_held_out_figures_are_those_of_cross_validation(together: Dataset) -> None:
+    found = checked_of(together, "physics")
+    points = cross_validate(together, "physics")
+    for name, protocol in (("held-out paths", "path"), ("held-out lidar", "lidar")):
+        told, of = found[name], figures_of(points[protocol])
+        assert told["places"] == len(points[protocol])
+        assert (told["mae"], told["skill"][0]) == (of.mae, of.skill)
+        assert told["skill"][1] <= of.skill <= told["skill"][2]
+        assert told["over_physics"] == [0.0, 0.0, 0.0]  # it is physics
+        assert 0.5 < told["coverage"][0] <= 1.0
+    assert "held-out district" not in found  # there is one
+    assert found["held-out lidar"]["of_paths"] == pytest.approx(1.0, abs=0.2)
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+
+
+def test_a_card_says_what_the_model_is_worth_where_it_is_asked_for(
+    runs: dict[str, Dataset], model: Any
+) -> None:
+    judged = ts.train_over(runs, recipe="physics", judge=True)
+    assert "checked" not in model.card
+    assert judged.card["checked"]["held-out paths"]["places"] == judged.card["places"]
+    assert any("held-out paths" in line for line in card_told(judged.card))
 
 
 def test_what_may_not_differ_is_refused_by_a_model_of_several_lidars_too(model: Any) -> None:

@@ -1,6 +1,6 @@
 """A model for every place: train it on a dataset, apply it to a table of factors."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 from tilestream.errors import ModelError, UsageError
 from tilestream.model.card import JUDGED, card_of
 from tilestream.model.dataset import TARGETS, Dataset, matrix
-from tilestream.model.domain import Domain, domain_of
+from tilestream.model.domain import WIDEST, Domain, domain_of
 from tilestream.model.explain import PIECE, Typical, compared, in_words, typical_of
 from tilestream.model.features import with_derived
 from tilestream.model.intervals import LEVEL, NOT_CALIBRATED, Interval, calibrate, wider_for_few
@@ -21,7 +21,7 @@ from tilestream.model.making import Outside, outside, shared
 from tilestream.model.physics import width_of
 from tilestream.model.registry import DEFAULT, OF_VIRTUAL_DRIVES, REGRESSORS
 from tilestream.model.regressor import Regressor, held_out_estimates
-from tilestream.model.splits import block_splits
+from tilestream.model.splits import block_splits, leave_lidar_out
 from tilestream.records import Column, Float64
 
 MAIN = "error_mean"
@@ -35,6 +35,8 @@ ESTIMATES = {
     "up_mean": "up",
 }
 """Name of each target's estimate."""
+WIDER = "wider_outside"
+"""Where a card says how many times longer an interval is outside of it."""
 WORST = 0.75
 """Places whose estimate is above this quantile of the training labels are given a reason."""
 PREDICTION_COLUMNS = (
@@ -107,6 +109,11 @@ class Model:
     """What it was trained on, and over which lidars and matchers it holds (`card_of`); empty: of
     an older version, for one lidar."""
 
+    @property
+    def wider_outside(self) -> float:
+        """How many times longer an interval is for a lidar or a matcher outside of the card."""
+        return float(self.card.get(WIDER, WIDEST))
+
 
 def train(
     dataset: Dataset, *, recipe: str = DEFAULT, seed: int = 0, n_jobs: int | None = 1
@@ -141,7 +148,11 @@ def train(
         typical = typical_of(whole.matrix(), whole.label(MAIN), whole.columns, pieces)
         domain = domain_of(dataset.matrix(), dataset.pieces)
     settings = regressor.tuned(dataset, MAIN, seed, n_jobs)
-    interval = _interval(dataset, regressor, settings, seed, n_jobs)
+    fit = partial(regressor.fit, target=MAIN, seed=seed, settings=settings, n_jobs=n_jobs)
+    interval = _interval(dataset, fit)
+    card = card_of(dataset)
+    if card[JUDGED]:
+        card[WIDER] = _wider_outside(dataset, fit, interval)
     # An axis or a tail that is the same everywhere teaches nothing and is learnt as that constant.
     there = [target for target in TARGETS if target in dataset.rows]
     regressors = {t: regressor.fit(dataset, t, seed, settings, n_jobs) for t in there}
@@ -168,7 +179,7 @@ def train(
             **({"wider_for_few_blocks": wider_for_few(interval.blocks)} if interval.blocks else {}),
             "lost": dataset.losses,
         },
-        card=card_of(dataset),
+        card=card,
     )
 
 
@@ -178,13 +189,7 @@ def _common(identities: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {k: v for k, v in first.items() if all(one.get(k) == v for one in identities)}
 
 
-def _interval(
-    dataset: Dataset,
-    regressor: type[Regressor],
-    settings: Mapping[str, Any],
-    seed: int,
-    n_jobs: int | None,
-) -> Interval:
+def _interval(dataset: Dataset, fit: Callable[[Dataset], Regressor]) -> Interval:
     """The interval, from estimates of blocks that the regressor has not seen.
 
     Settings and width were chosen on these blocks too, so the interval is a little narrower than
@@ -195,9 +200,28 @@ def _interval(
         splits = block_splits(dataset)
     except ModelError:
         return NOT_CALIBRATED
-    fit = partial(regressor.fit, target=MAIN, seed=seed, settings=settings, n_jobs=n_jobs)
     estimate = held_out_estimates(dataset, splits, fit)
     return calibrate(dataset.label(MAIN), estimate, dataset.pieces, LEVEL)
+
+
+def _wider_outside(
+    dataset: Dataset, fit: Callable[[Dataset], Regressor], interval: Interval
+) -> float:
+    """How many times longer an interval is for a lidar or a matcher outside of the card: as much as
+    it has to be for lidars that are held out, the hardest of them counting twice; at least 1 and at
+    most `WIDEST`, which it is where none can be held out.
+    """
+    try:
+        splits = leave_lidar_out(dataset)
+    except ModelError:
+        return WIDEST
+    if not interval.blocks:
+        return WIDEST
+    estimate = held_out_estimates(dataset, splits, fit)
+    lidars = dataset.rows["lidar"].to_numpy(str)
+    unseen = calibrate(dataset.label(MAIN), estimate, lidars, LEVEL)
+    (low, high), (least, most) = (one.around(estimate) for one in (interval, unseen))
+    return float(np.clip(np.mean(most - least) / np.mean(high - low), 1.0, WIDEST))
 
 
 def predict(
@@ -233,7 +257,7 @@ def predict(
         for target, regressor in model.regressors.items():
             out[ESTIMATES[target]][good] = regressor.predict(places)
         out["domain_distance"][good] = model.domain.distance(X[good])
-    widen = model.domain.widen(out["domain_distance"])
+    widen = model.domain.widen(out["domain_distance"]) * (model.wider_outside if strange else 1.0)
     out["low"], out["high"] = model.interval.around(out["estimate"], widen)
     in_domain = good & (out["domain_distance"] <= model.domain.threshold) & (not strange)
     columns: dict[str, Any] = {
@@ -347,6 +371,8 @@ def _reasons(
         words[row] = f"{words[row]}; {told}" if words[row] else told
     if strange:
         otherwise = f"seen otherwise than where the model was trained ({_listed(strange)})"
+        if not np.isnan(model.interval.level):
+            otherwise += f", its interval {model.wider_outside:.2g} times wider"
         for row in np.flatnonzero(good):
             words[row] = f"{words[row]}; {otherwise}" if words[row] else otherwise
     given = table["reason"].fillna("").astype(str).to_numpy() if "reason" in table else None

@@ -2,10 +2,12 @@
 
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from tilestream.errors import SourceNotFoundError, UsageError
 from tilestream.files import Files, place_of
+from tilestream.model.checked import CHECKED, checked_of
 from tilestream.model.dataset import Dataset
 from tilestream.model.file import save_model
 from tilestream.model.over_runs import DISTRICT, Run, over_runs
@@ -23,6 +25,7 @@ def train_over(
     recipe: str = DEFAULT,
     seed: int = 0,
     districts: Mapping[str, str] | None = None,
+    judge: bool = False,
     out: str | os.PathLike[str] | None = None,
 ) -> Model:
     """Train one model over several runs, each with its own lidar, matcher, seed or district.
@@ -35,6 +38,8 @@ def train_over(
         districts: where a run was driven, by its name. Streets of one district are the same where
             they have the same name or are near: none trains where it is held out. Not given: the
             city of a simulated run; all others are one district.
+        judge: whether its card says what it is worth on streets, lidars and districts that are held
+            out (`checked_of`), which takes minutes.
         out: where the model is written, a path or an fsspec URL; None: nowhere.
 
     Raises:
@@ -42,15 +47,25 @@ def train_over(
         UsageError: no run, a district of an unknown run, or a recipe that does not know the lidar.
         ModelError: runs that differ in what must be equal (`over_runs`), or too few places.
     """
+    dataset = dataset_over(runs, districts)
+    model = train(dataset, recipe=recipe, seed=seed)
+    if judge:
+        model = replace(model, card={**model.card, CHECKED: checked_of(dataset, recipe, seed)})
+    if out is not None:
+        save_model(model, out)
+    return model
+
+
+def dataset_over(
+    runs: Mapping[str, str | os.PathLike[str] | Dataset],
+    districts: Mapping[str, str] | None = None,
+) -> Dataset:
+    """What `train_over` trains on; arguments and errors as there."""
     named = dict(districts or {})
     unknown = sorted(set(named) - set(runs))
     if unknown:
         raise UsageError(f"districts has {', '.join(unknown)}, and no run is named so")
-    dataset = over_runs({name: _run(of, named.get(name)) for name, of in runs.items()})
-    model = train(dataset, recipe=recipe, seed=seed)
-    if out is not None:
-        save_model(model, out)
-    return model
+    return over_runs({name: _run(of, named.get(name)) for name, of in runs.items()})
 
 
 def _run(of: str | os.PathLike[str] | Dataset, district: str | None) -> Run:
