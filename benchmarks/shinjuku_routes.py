@@ -1,9 +1,10 @@
 """Lay the routes of the simulated Shinjuku through its streets.
 
-    python benchmarks/shinjuku_routes.py ROUTES.geojson
+    python benchmarks/shinjuku_routes.py FOLDER
 
-The package's own file is tilestream/data/shinjuku_routes.geojson. The waypoints are ours; the ways
-between them keep clear of the real buildings.
+The package's own files are in tilestream/data: shinjuku_routes.geojson, and demo_routes.geojson,
+600 m of path I with a crossing, a bridge and a tunnel. The waypoints are ours; the ways between
+them keep clear of the real buildings.
 """
 
 import argparse
@@ -15,7 +16,7 @@ def options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("routes", type=Path, help="the file to write")
+    parser.add_argument("folder", type=Path, help="the folder to write to")
     return parser.parse_args()
 
 
@@ -23,6 +24,7 @@ if __name__ == "__main__":
     GIVEN = options()  # before what is slow to import
 
 import json
+from typing import Any
 
 import numpy as np
 
@@ -137,6 +139,8 @@ SPOTS = {
     "E2": [("one-sided", 100, 240, "left"), ("bridge", 300, 330, "right")],
 }
 NAMES = ("kind", "begin", "end", "side")
+DEMO = (230, 831)
+"""Sample points of path I that the demo drives along."""
 
 
 def main(given: argparse.Namespace) -> None:
@@ -153,8 +157,25 @@ def main(given: argparse.Namespace) -> None:
         properties = {"name": name, "kind": kind, "driven": points is not None, "spots": spots}
         geometry = {"type": "LineString", "coordinates": xy.tolist()}
         features.append({"type": "Feature", "properties": properties, "geometry": geometry})
-    document = {"type": "FeatureCollection", "name": "shinjuku routes", "features": features}
-    given.routes.write_text(json.dumps(document) + "\n")
+    write(given.folder / "shinjuku_routes.geojson", "shinjuku routes", features)
+    write(given.folder / "demo_routes.geojson", "demo route", [cut(features[0], *DEMO)])
+
+
+def write(path: Path, name: str, features: list[dict[str, Any]]) -> None:
+    """Write a file of routes."""
+    document = {"type": "FeatureCollection", "name": name, "features": features}
+    path.write_text(json.dumps(document) + "\n")
+
+
+def cut(route: dict[str, Any], begin: int, end: int) -> dict[str, Any]:
+    """A stretch of a route, with those of its spots that lie within."""
+    spots = [
+        {**spot, "begin": spot["begin"] - begin, "end": spot["end"] - begin}
+        for spot in route["properties"]["spots"]
+        if begin <= spot["begin"] and spot["end"] < end
+    ]
+    line = {"type": "LineString", "coordinates": route["geometry"]["coordinates"][begin:end]}
+    return {**route, "properties": {**route["properties"], "spots": spots}, "geometry": line}
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from tilestream.bounded_yaml import read_yaml
 from tilestream.config import Settings
 from tilestream.errors import SourceNotFoundError, UsageError
 from tilestream.files import local_path
+from tilestream.records import Float64
 from tilestream.sensor import SENSORS, Sensor, Vehicle, named
 
 SHINJUKU = "shinjuku"
@@ -51,6 +52,16 @@ class CitySettings(Settings):
     """Share of the parking places along the curb that are taken."""
     slope: Length = 0.01
     """Steepest slope of the ground, m per m."""
+
+    crs: str | None = None
+    """CRS in which map, poses and routes are written; null: the local metres of the files."""
+    origin: tuple[float, float] = (0.0, 0.0)
+    """Where the zero of the files is in it [m]."""
+
+    @property
+    def shift(self) -> Float64:
+        """(3,) from the metres of the files to those that are written [m]."""
+        return np.array([*self.origin, 0.0])
 
     def of_district(self, name: str) -> Self:
         """The same in another district that ships with tilestream."""

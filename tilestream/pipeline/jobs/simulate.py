@@ -193,7 +193,10 @@ def _survey(
     return Task(
         survey,
         f"{street.name}-{passes}-{stretch[0]}",
-        SurveyBlock(str(folder / "survey" / f"{street.name}_{passes}_{stretch[0]:05d}.laz")),
+        SurveyBlock(
+            str(folder / "survey" / f"{street.name}_{passes}_{stretch[0]:05d}.laz"),
+            settings.city.crs,
+        ),
         takes={"street": street.name, "stretch": stretch, "passes": passes},
         reads={"city": city},
         work=points,
@@ -373,7 +376,9 @@ def _begin(folder: Path, city: City, identity: dict[str, Any]) -> None:
     }
     end = SMALL_POINTS if identity["size"] == "small" else None
     features = [_feature(street, city, end) for street in city.streets]
-    routes = {"type": "FeatureCollection", "features": features}
+    crs = city.settings.city.crs
+    named = {} if crs is None else {"crs": {"type": "name", "properties": {"name": crs}}}
+    routes = {"type": "FeatureCollection", **named, "features": features}
     _keep(folder / ROUTES, f"{json.dumps(routes)}\n")
     _keep(folder / RECORD, yaml.safe_dump(facts, sort_keys=True, allow_unicode=True))
 
@@ -387,7 +392,7 @@ def _keep(path: Path, text: str) -> None:
 def _feature(street: Street, city: City, end: int | None) -> dict[str, Any]:
     """A street as GeoJSON, as far as it is simulated, with the height of its road."""
     motion = replace(motion_of(street, city.settings, 0.0), side=0.0)
-    line = motion.pose(city.ground, street.arc[:end])[:, :3, 3]
+    line = motion.pose(city.ground, street.arc[:end])[:, :3, 3] + city.settings.city.shift
     properties = {
         "name": street.name,
         "kind": street.kind,

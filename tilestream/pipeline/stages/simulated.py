@@ -1,7 +1,7 @@
 """Survey, scan, log: a city is simulated stretch by stretch of its streets."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -73,9 +73,12 @@ class _WholeFile:
 class SurveyBlock(_WholeFile):
     """A block of the survey: LAZ."""
 
+    crs: str | None = None
+    """That its header names."""
+
     def write(self, made: Made, identity: str, columns: Sequence[Column]) -> Facts:  # noqa: ARG002
         """Write its points."""
-        write_las(self.path, made.value)
+        write_las(self.path, made.value, crs=self.crs)
         return {"points": len(made.value)}
 
     def read(self) -> Any:
@@ -132,7 +135,8 @@ class DriveLog(_WholeFile):
 )
 def survey(city: City, street: str, stretch: tuple[int, int], passes: int) -> Any:
     """One pass of the mapping vehicle along a stretch of a street: (n, 3) points [m]."""
-    return survey_of(city, city.street(street), stretch, passes)
+    found = survey_of(city, city.street(street), stretch, passes)
+    return found + city.settings.city.shift
 
 
 @stage("scan", version=1, memory=lambda _: SCENE_BYTES, seconds=0.03)
@@ -175,4 +179,11 @@ def log(
         for times in (regular, often)
     )
     scans = (scan for part in parts for scan in part)
-    return Made((scans, odometry(city, believed, driven), truth), {"scans": len(seen)})
+    poses = [_shifted(one, city) for one in (odometry(city, believed, driven), truth)]
+    return Made((scans, *poses), {"scans": len(seen)})
+
+
+def _shifted(poses: Trajectory, city: City) -> Trajectory:
+    T = poses.T_map_lidar.copy()
+    T[:, :3, 3] += city.settings.city.shift
+    return replace(poses, T_map_lidar=T)
