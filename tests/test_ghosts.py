@@ -9,6 +9,7 @@ from tilestream.factors.ghosts import (
     AROUND,
     BLOCK,
     HIGH_MM,
+    LEVEL,
     LOW_MM,
     OPEN,
     REACH_EDGES,
@@ -57,6 +58,16 @@ def test_what_passed_is_a_ghost_and_what_stands_is_not() -> None:
         assert not ghost[of[name]].any(), name
 
 
+def test_stray_returns_below_the_road_are_no_ground() -> None:
+    centres, of = street()
+    rng = np.random.default_rng(0)
+    stray = rng.integers((0, 0, -6_000), (40_000, 12_000, -1_000), (150, 3))
+    mirrored = box((32, 20, -12), (34, 24, -6))
+    found = ghosts_among(np.concatenate([centres, stray, mirrored]), EDGE)[: len(centres)]
+    np.testing.assert_array_equal(found, ghosts_among(centres, EDGE))
+    assert found[of["passed"]].sum() > 500
+
+
 @pytest.mark.parametrize("shift", [(0, 0, 137), (-33_000, 12_000, -5_001), (3 * 10**8, 10**9, 0)])
 def test_whole_metres_of_translation_do_not_show(shift: tuple[int, int, int]) -> None:
     centres, _ = street()
@@ -67,30 +78,41 @@ def test_whole_metres_of_translation_do_not_show(shift: tuple[int, int, int]) ->
 def literal(centre_mm: np.ndarray) -> Mask:
     """The definition, one surfel after the other."""
     column = centre_mm[:, :2] // EDGE
-    block = column // BLOCK
     found = np.zeros(len(centre_mm), np.bool_)
+    lowest: dict[tuple[int, int], int] = {}
+    for x, y, z in (centre_mm // (EDGE, EDGE, 1)).tolist():
+        lowest[x, y] = min(z, lowest.get((x, y), z))
+    level = {
+        (i, j): z
+        for (i, j), z in lowest.items()
+        if sum(abs(lowest.get((i + a, j + b), 10**9) - z) <= LOW_MM for a in STEPS for b in STEPS)
+        >= LEVEL
+    }
+
+    def ground(at: np.ndarray) -> float:
+        i, j = at // BLOCK
+        near = [z for (x, y), z in level.items() if abs(x // BLOCK - i) < 2 > abs(y // BLOCK - j)]
+        return min(near, default=np.nan)
+
     for row, z in enumerate(centre_mm[:, 2]):
 
         def shows(at: np.ndarray) -> bool:
             here = centre_mm[(column == at).all(axis=1), 2]
-            near = (np.abs(block - at // BLOCK) <= 1).all(axis=1)
             if not len(here):
                 return False
-            low = centre_mm[near, 2].min()
+            low = ground(at)
             return bool(here.min() <= low + LOW_MM and here.max() <= low + HIGH_MM)
 
         def stands(at: np.ndarray) -> int:
             """How much of a column is above the ground and open."""
             here = centre_mm[(column == at).all(axis=1), 2]
-            near = (np.abs(block - at // BLOCK) <= 1).all(axis=1)
             around = [shows(at + np.array((i, j))) for i in STEPS for j in STEPS]
             if not shows(at) or sum(around) < OPEN * len(around):
                 return 0
-            height = here - centre_mm[near, 2].min()
+            height = here - ground(at)
             return int(((height > LOW_MM) & (height <= HIGH_MM)).sum())
 
-        near = (np.abs(block - block[row]) <= 1).all(axis=1)
-        height = z - centre_mm[near, 2].min()
+        height = z - ground(column[row])
         if LOW_MM < height <= HIGH_MM and stands(column[row]):
             around = [stands(column[row] + np.array((i, j))) > 0 for i in STEPS for j in STEPS]
             found[row] = stands(column[row]) < UPRIGHT or sum(around) > SLIM
@@ -105,7 +127,8 @@ def test_the_ghosts_are_those_of_the_literal_reference(seed: int) -> None:
     kept = ground[rng.uniform(size=len(ground)) < 0.9]
     above = rng.integers((-1800, -1200, 0), (1600, 1400, 4500), (25, 3))
     post = np.array([[300, 300, 300 + 200 * k] for k in range(rng.integers(3, 14))])
-    centres = np.concatenate([kept, above, post])
+    below = rng.integers((-1800, -1200, -3000), (1600, 1400, 0), (6, 3))
+    centres = np.concatenate([kept, above, post, below])
     np.testing.assert_array_equal(ghosts_among(centres, EDGE), literal(centres))
 
 

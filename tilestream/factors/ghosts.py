@@ -20,8 +20,11 @@ UPRIGHT = 6
 """Least surfels of a column that is upright: 1.2 m."""
 SLIM = 4
 """Most columns of the 5 x 5 around that have something above the ground where it is slim."""
-REACH_EDGES = 2 * BLOCK + 2 * AROUND
-"""How far around a surfel the map is needed to decide whether it is a ghost [edges]: 2.8 m."""
+LEVEL = (AROUND + 1) ** 2
+"""Least columns of the 5 x 5 around a column of ground, itself included, that begin at its height:
+as many as at the corner of a level piece of ground."""
+REACH_EDGES = 2 * BLOCK + 3 * AROUND
+"""How far around a surfel the map is needed to decide whether it is a ghost [edges]: 3.2 m."""
 NONE_MM = 2**30
 """Height of a column without surfels: above all ground [mm]."""
 
@@ -32,10 +35,11 @@ Int64 = NDArray[np.int64]
 def ghosts_among(centre_mm: Int64, edge_mm: int) -> NDArray[np.bool_]:
     """Which surfels are ghosts.
 
-    A ghost stands 0.3 to 3.4 m above the ground, the lowest surfel of the blocks of 1 m around. Its
-    own column, of one voxel, and 70 % of the 5 x 5 around it show ground and nothing above 3.4 m.
-    Of these columns, those that are upright and slim are none: 6 surfels or more above the ground,
-    in at most 4 columns of the 5 x 5.
+    A ghost stands 0.3 to 3.4 m above the ground, the lowest surfel of the blocks of 1 m around that
+    lies level with others: mirrored and stray returns lie below the road. Its own column, of one
+    voxel, and 70 % of the 5 x 5 around it show ground and nothing above 3.4 m. Of these columns,
+    those that are upright and slim are none: 6 surfels or more above the ground, in at most 4
+    columns of the 5 x 5.
 
     Args:
         centre_mm: (n, 3) centres of the surfels of a part of the map [mm, map frame]; within
@@ -56,8 +60,9 @@ def ghosts_among(centre_mm: Int64, edge_mm: int) -> NDArray[np.bool_]:
     lowest, highest = (np.full(shape, none, np.int32) for none in (NONE_MM, -NONE_MM))
     np.minimum.at(lowest.reshape(-1), at, z)
     np.maximum.at(highest.reshape(-1), at, z)
-    ground = _ground(lowest)
-    shows = (lowest < NONE_MM) & (lowest <= ground + LOW_MM) & (highest <= ground + HIGH_MM)
+    ground = _ground(np.where(_is_level(lowest), lowest, np.int32(NONE_MM)))
+    there = (lowest < NONE_MM) & (ground < NONE_MM)
+    shows = there & (lowest <= ground + LOW_MM) & (highest <= ground + HIGH_MM)
     is_open = shows & (_sum_around(shows) >= OPEN * (2 * AROUND + 1) ** 2)
     height = z - ground.reshape(-1)[at]
     stands = (height > LOW_MM) & (height <= HIGH_MM) & is_open.reshape(-1)[at]
@@ -65,6 +70,17 @@ def ghosts_among(centre_mm: Int64, edge_mm: int) -> NDArray[np.bool_]:
     slim = (count >= UPRIGHT) & (_sum_around(count > 0) <= SLIM)
     found: NDArray[np.bool_] = stands & ~slim.reshape(-1)[at]
     return found
+
+
+def _is_level(lowest: Int32) -> NDArray[np.bool_]:
+    """Which columns begin within 0.3 m of as high as enough of the 5 x 5 around them do."""
+    padded = np.pad(lowest, AROUND, constant_values=NONE_MM)
+    rows, columns = lowest.shape
+    count = np.zeros(lowest.shape, np.uint8)
+    for i in range(2 * AROUND + 1):
+        for j in range(2 * AROUND + 1):
+            count += np.abs(padded[i : i + rows, j : j + columns] - lowest) <= LOW_MM
+    return count >= LEVEL
 
 
 def _ground(lowest: Int32) -> Int32:

@@ -23,7 +23,7 @@ from tilestream.kernels.surfels import NORMAL_ONE, surfels_of
 from tilestream.records import Float64, Int64
 from tilestream.store import Tile, TileStore, TileTable
 
-SURFELS_VERSION = 2
+SURFELS_VERSION = 3
 """Raise it when the surfels that are made from the same points change."""
 FINEST_MM = 200
 """Smallest edge of the voxels of surfels [mm]."""
@@ -37,7 +37,7 @@ than its planes reach."""
 FINE_EDGES = CLEAR_EDGES + GHOST_EDGES
 """How far around a tile the first level is made [edges]."""
 REACH_EDGES = FINE_EDGES + PLANE_EDGES
-"""How far around a tile its surfels depend on points [edges]: 5.6 m."""
+"""How far around a tile its surfels depend on points [edges]: 6.0 m."""
 
 
 @dataclass(frozen=True, eq=False)
