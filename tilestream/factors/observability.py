@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from tilestream.errors import RegistrationError, TileNotReadyError, UsageError
 from tilestream.factors.hessian import HESSIAN_COLUMNS, hessian_factors, turned_by
+from tilestream.factors.seen_from import SURVEY_COLUMNS, survey_factors
 from tilestream.factors.surfels import Surfels, in_view, surfel_mm, surfels_in
 from tilestream.factors.table import NO_GROUND, places_of
 from tilestream.factors.virtual_drive import COLUMNS as DRIVE_COLUMNS
@@ -68,7 +69,7 @@ VIEW_COLUMNS = (
     _column("ob_unmapped", "1", "Share of the beams that meet nothing and leave the mapped area."),
     _column("ob_ghosts", "1", "Share of the beams that traffic in the map would stop, left out."),
 )
-COLUMNS = (*HESSIAN_COLUMNS, *VIEW_COLUMNS, *DRIVE_COLUMNS)
+COLUMNS = (*HESSIAN_COLUMNS, *VIEW_COLUMNS, *SURVEY_COLUMNS, *DRIVE_COLUMNS)
 """All columns of the criterion."""
 
 
@@ -240,7 +241,9 @@ class _View:
             drives = self.drives(around.cells, scans, T_map_lidar)
         except RegistrationError as error:
             return {**view, "status": "failed", "reason": str(error)}
-        return {**view, **held, **virtual_drive(drives), "status": "done", "reason": ""}
+        own = around.cells.cells if isinstance(around.cells, LocalCells) else around.cells
+        survey = survey_factors(own, scan.points, T_map_lidar)
+        return {**view, **held, **survey, **virtual_drive(drives), "status": "done", "reason": ""}
 
     def scans(
         self, around: "_Block", found: tuple[Returns, ...], place_mm: Int64, heading: float

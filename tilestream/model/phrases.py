@@ -47,6 +47,10 @@ UNMAPPED = "much of the view is not in the map"
 MAPPED = "all of the view is in the map"
 TRAFFIC = "traffic baked into the map stands in view"
 EMPTY = "no traffic baked into the map"
+SPARSE = "a sparse map, surveyed once or from afar"
+OFTEN = "a dense map, surveyed often or from near"
+THIN = "thin walls, as a single pass leaves them"
+THICK = "thick walls, passes that disagree or rough surfaces"
 
 PHRASES: dict[str, tuple[str, str]] = {
     "feature_count": (FEW, CROWDED),
@@ -104,6 +108,8 @@ PHRASES: dict[str, tuple[str, str]] = {
     "ob_returns": (UNSEEN, CLOSED),
     "ob_unmapped": (MAPPED, UNMAPPED),
     "ob_ghosts": (EMPTY, TRAFFIC),
+    "ob_density": (SPARSE, OFTEN),
+    "ob_thickness": (THIN, THICK),
     "vd_mean": (HOLDS, DRIFTS),
     "vd_floor": (HOLDS, DRIFTS),
     "vd_tail": (HOLDS, STRAYS),
@@ -113,7 +119,7 @@ PHRASES: dict[str, tuple[str, str]] = {
     "vd_up": (HOLDS, SINKS),
 }
 """What a value below, or above, that of a typical training place says about a place."""
-REASSURING = frozenset({ALL_SIDES, SPANNED, DENSE, STEEP, HOLDS, FIRM, ALIKE, MAPPED, EMPTY})
+REASSURING = frozenset({ALL_SIDES, SPANNED, DENSE, STEEP, HOLDS, FIRM, ALIKE, MAPPED, EMPTY, OFTEN})
 """What explains no error, on whichever side the factor is bad."""
 
 
