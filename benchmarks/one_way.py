@@ -1,11 +1,12 @@
 """What a map that was surveyed one way only costs, in a simulated city.
 
-    python benchmarks/one_way.py --out FOLDER [--paths II IV] [--metres 120] [--json FILE]
+    python benchmarks/one_way.py --out FOLDER [--paths II IV] [--metres 120] [--spacing 2]
 
 A stretch of each path is surveyed there and back. Two maps are made of it, of the way there alone
 and of both ways, and two drives localized in each: the way there, in the lane of that survey, and
 the way back in the other lane. So in one of the four cases the drive sees the street from where no
-survey has seen it. Measured and estimated errors as in drives.py, with its bootstrap.
+survey has seen it. Measured and estimated errors as in drives.py, with its bootstrap; the blocks
+are squares of 15 m of the city, the same in all four cases.
 """
 
 import argparse
@@ -23,6 +24,7 @@ def options() -> argparse.Namespace:
     parser.add_argument("--paths", nargs="+", default=["II", "IV"], help="streets by name")
     parser.add_argument("--metres", type=int, default=120, help="of each, from its beginning")
     parser.add_argument("--rays", type=int, help="of the survey, per metre")
+    parser.add_argument("--spacing", type=float, default=2.0, help="between places [m]")
     return parser.parse_args()
 
 
@@ -30,11 +32,14 @@ if __name__ == "__main__":
     GIVEN = options()  # before what is slow to import
 
 import json
+from typing import Any
 
+import numpy as np
 import pandas as pd
-from drives import PARTS, Judged, blocks, level_told, show, told
+from drives import BLOCK, PARTS, Figure, Judged, Rows, figure, level_told, show, spearman, told
 
 import tilestream as ts
+from tilestream.factors.seen_from import SURVEY_COLUMNS
 from tilestream.pipeline.jobs.simulate import simulate
 from tilestream.simulation.city import data_file
 from tilestream.simulation.settings import SimulationSettings, load_preset
@@ -44,6 +49,9 @@ SIDE = 1.5
 MAPS = {"one way": "*_0_*.laz", "both ways": "*.laz"}
 """Files of the survey that each map is made of."""
 DRIVES = ("there", "back")
+WITH_BRACKETS = ("mean", "along", "across", "floor")
+COSTS = ("mean", "along", "across")
+"""Parts whose ratios are printed with their bootstrap: measured / estimated, one way / both."""
 
 
 def stretch(given: argparse.Namespace, settings: SimulationSettings) -> Path:
@@ -98,7 +106,7 @@ def measured(given: argparse.Namespace) -> pd.DataFrame:
                 for group in [f"{drive} {path}"]
             ],
             routes=[str(folders["there"] / "routes.geojson")],
-            spacing=2.0,
+            spacing=given.spacing,
             observe={"blind_rear_deg": lidar.blind_deg},
             label={"matcher": "autoware"},
             model={"recipe": "physics", "offset": 0.0},
@@ -107,31 +115,86 @@ def measured(given: argparse.Namespace) -> pd.DataFrame:
         tables.append(ts.dataset(out).rows.assign(street=name))
     table = pd.concat(tables, ignore_index=True)
     table["lidar"] = table["group"].str.split(" ").str[0]
-    return table.assign(block=blocks(table, "path"))
+    square = np.floor(table[["x", "y"]] / BLOCK).astype(int).astype(str)
+    return table.assign(block=square["x"] + " " + square["y"])
+
+
+def cost(judged: Judged, column: str, drive: str) -> Figure:
+    """The median of a column in the map of one way over that in the map of both ways."""
+    values, street = judged.numbers[column], judged.table["street"].to_numpy(str)
+
+    def ratio(rows: Rows) -> float:
+        one, both = (values[rows[street[rows] == name]] for name in MAPS)
+        return float(np.median(one) / np.median(both)) if len(one) and len(both) else np.nan
+
+    return figure(judged.table, judged.rows(lidar=drive), ratio)
+
+
+def follows(judged: Judged, column: str) -> dict[str, Figure]:
+    """Spearman of a column with which map it is, and with measured / estimated of `COSTS`."""
+    table = judged.table
+    against = {"one way": (table["street"] == next(iter(MAPS))).to_numpy(np.float64)}
+    for part in COSTS:
+        label, estimate = (judged.numbers[name] for name in PARTS[part])
+        against[part] = label / estimate
+    seen = table[column].to_numpy(np.float64)
+    return {
+        name: figure(table, judged.rows(), lambda rows, y=y: spearman(seen[rows], y[rows]))
+        for name, y in against.items()
+    }
+
+
+def figures(judged: Judged) -> dict[str, Any]:
+    """All figures, by name."""
+    label, estimate = PARTS["mean"]
+    cases = {
+        f"{name}, {drive}": {"street": name, "lidar": drive} for name in MAPS for drive in DRIVES
+    }
+    return {
+        "level": {
+            name: {part: judged.level(part, **which) for part in PARTS}
+            for name, which in cases.items()
+        },
+        "ranks": {name: judged.ranks(estimate, label, **which) for name, which in cases.items()},
+        "cost": {
+            drive: {part: [cost(judged, column, drive) for column in PARTS[part]] for part in COSTS}
+            for drive in DRIVES
+        },
+        "columns": {each.name: follows(judged, each.name) for each in SURVEY_COLUMNS},
+    }
+
+
+def tell(found: dict[str, Any]) -> None:
+    """Print all figures."""
+    levels = [
+        (name, str(found["ranks"][name]["places"]), *(level_told(*part) for part in level.items()))
+        for name, level in found["level"].items()
+    ]
+    title = "Measured / estimated [cm; p_fail: share]: ratio"
+    show(title, f"survey and drive, places, {', '.join(PARTS)}", levels)
+    ratios = [
+        (name, *(told(level[part]) for part in WITH_BRACKETS), told(found["ranks"][name]))
+        for name, level in found["level"].items()
+    ]
+    names = f"survey and drive, {', '.join(WITH_BRACKETS)}, Spearman of mean"
+    show("Measured / estimated, with the bootstrap", names, ratios)
+    costs = [
+        (drive, *(told(each) for part in parts.values() for each in part))
+        for drive, parts in found["cost"].items()
+    ]
+    names = ", ".join(f"{part} {what}" for part in COSTS for what in ("measured", "estimated"))
+    show("One way / both ways", f"drive, {names}", costs)
+    lines = [(name, *map(told, one.values())) for name, one in found["columns"].items()]
+    names = ", ".join(f"measured / estimated {part}" for part in COSTS)
+    show("Spearman of what the map shows of its survey", f"column, one way, {names}", lines)
 
 
 def main(given: argparse.Namespace) -> None:
-    """Simulate, run, print."""
+    """Simulate, run, judge, print."""
     table = measured(given)
     table.to_parquet(given.out / "places.parquet")
-    judged, found, lines = Judged(table), {}, []
-    label, estimate = PARTS["mean"]
-    for name in MAPS:
-        for drive in DRIVES:
-            which = {"street": name, "lidar": drive}
-            level = {part: judged.level(part, **which) for part in PARTS}
-            rank = judged.ranks(estimate, label, **which)
-            found[f"{name}, {drive}"] = {"level": level, "spearman": rank}
-            words = (level_told(part, one) for part, one in level.items())
-            lines.append(
-                (name, drive, str(rank["places"]), *words, told(level["mean"]), told(rank))
-            )
-    parts = ", ".join(PARTS)
-    show(
-        "Measured / estimated [cm; p_fail: share]: ratio",
-        f"survey, drive, places, {parts}, ratio of mean, Spearman",
-        lines,
-    )
+    found = figures(Judged(table))
+    tell(found)
     if given.json:
         given.json.write_text(json.dumps(found, indent=1) + "\n")
 
