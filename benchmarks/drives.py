@@ -54,8 +54,10 @@ from scipy.stats import rankdata
 
 import tilestream as ts
 from tilestream.errors import PartialError
+from tilestream.model.dataset import Dataset
 from tilestream.model.file import load_model
-from tilestream.model.training import predict
+from tilestream.model.training import Model, predict
+from tilestream.pipeline.jobs.train_over import as_read
 
 LIDARS: dict[str, dict[str, float]] = {
     "as-recorded": {},
@@ -122,6 +124,7 @@ def measured(given: argparse.Namespace) -> tuple[pd.DataFrame, pd.DataFrame]:
         of the streets; and the labels that have no estimate.
     """
     tables, lost = [], []
+    model = None if given.model is None else load_model(given.model)
     for log in given.logs:
         settings = settings_of(log, given)
         try:
@@ -129,7 +132,10 @@ def measured(given: argparse.Namespace) -> tuple[pd.DataFrame, pd.DataFrame]:
         except PartialError as error:
             print(f"{street_of(log)}: {error}")
         found = ts.dataset(settings.out)
-        tables.append(found.rows.assign(street=street_of(log)))
+        rows = found.rows.assign(street=street_of(log))
+        if model is not None:
+            rows = pd.concat([rows, said_by(model, settings, found)], axis=1)
+        tables.append(rows)
         lost.append(found.lost.assign(street=street_of(log)))
     table = pd.concat(tables).rename(columns={"group": "lidar"})
     table = table.sort_values(["street", "lidar", "arc_length"], kind="stable", ignore_index=True)
@@ -255,27 +261,41 @@ def neighbours(table: pd.DataFrame) -> NDArray[np.float64]:
     return found
 
 
-def intervals(table: pd.DataFrame, model: Path) -> dict[str, dict[str, Figure]]:
-    """By lidar: share of the places in the model's interval, and unlike its training. The model is
-    applied whatever lidar it was trained for: its domain has to tell.
+def said_by(model: Model, settings: ts.RunSettings, found: Dataset) -> pd.DataFrame:
+    """What a model says of the places of a dataset, each as its lidar sees them: `said`, `low` and
+    `high` [m], `in_domain`.
     """
-    said = predict(load_model(model), table)
-    done = (said["status"] == "done").to_numpy()
+    makings, rows = as_read(settings), found.averaged(model.width).rows
+    parts = [predict(model, part, makings[group]) for group, part in rows.groupby("group")]
+    said = pd.concat(parts).loc[rows.index].rename(columns={"estimate": "said"})
+    return said[["said", "low", "high", "in_domain"]]
+
+
+def intervals(table: pd.DataFrame) -> dict[str, dict[str, dict[str, Figure]]]:
+    """By street (`all`: all), then by lidar: share of the places in the model's interval, and
+    unlike its training, and how large the estimates and the errors are.
+    """
     error = table["error_mean"]
-    held = ((said["low"] <= error) & (error <= said["high"])).to_numpy(np.float64)
-    strange = (~said["in_domain"].astype(bool)).to_numpy(np.float64)
-    found = {}
-    for lidar in LIDARS:
-        rows = np.flatnonzero(done & (table["lidar"] == lidar).to_numpy())
-        found[lidar] = {
-            "held": figure(table, rows, lambda some: float(held[some].mean())),
-            "out_of_domain": figure(table, rows, lambda some: float(strange[some].mean())),
-            "estimated": {"value": float(said["estimate"].to_numpy()[rows].mean())},
-        }
+    held = ((table["low"] <= error) & (error <= table["high"])).to_numpy(np.float64)
+    strange = (~table["in_domain"].astype(bool)).to_numpy(np.float64)
+    done, off = table["said"].notna().to_numpy(), (table["said"] - error).abs().to_numpy()
+    found: dict[str, dict[str, dict[str, Figure]]] = {}
+    for street in ("all", *dict.fromkeys(table["street"])):
+        there = done if street == "all" else done & (table["street"] == street).to_numpy()
+        found[street] = {}
+        for lidar in LIDARS:
+            rows = np.flatnonzero(there & (table["lidar"] == lidar).to_numpy())
+            found[street][lidar] = {
+                "held": figure(table, rows, lambda some: float(held[some].mean())),
+                "out_of_domain": figure(table, rows, lambda some: float(strange[some].mean())),
+                "off": figure(table, rows, lambda some: float(off[some].mean())),
+                "estimated": {"value": float(np.median(table["said"].to_numpy()[rows]))},
+                "measured": {"value": float(np.median(error.to_numpy()[rows]))},
+            }
     return found
 
 
-def figures(table: pd.DataFrame, lost: pd.DataFrame, model: Path | None) -> dict[str, Any]:
+def figures(table: pd.DataFrame, lost: pd.DataFrame) -> dict[str, Any]:
     """All figures, by name."""
     judged = Judged(table)
     label, estimate = PARTS["mean"]
@@ -309,8 +329,8 @@ def figures(table: pd.DataFrame, lost: pd.DataFrame, model: Path | None) -> dict
             "difference": judged.within(lambda each: each(estimate) - each("neighbours")),
         },
     }
-    if model is not None:
-        found["model"] = intervals(table, model)
+    if "said" in table:
+        found["model"] = intervals(table)
     return found
 
 
@@ -372,20 +392,24 @@ def tell(found: dict[str, Any]) -> None:
     if "model" in found:
         lines = [
             (
+                street,
                 lidar,
-                f"{CM * one['estimated']['value']:.1f}",
+                f"{CM * one['measured']['value']:.1f} / {CM * one['estimated']['value']:.1f}",
+                f"{CM * one['off']['value']:.1f}",
                 f"{one['held']['value']:.0%} +- {one['held']['standard_error']:.0%}",
                 f"{one['out_of_domain']['value']:.0%}",
             )
-            for lidar, one in found["model"].items()
+            for street, lidars in found["model"].items()
+            for lidar, one in lidars.items()
         ]
-        show("The model's 90 % intervals", "lidar, estimate [cm], held, out of domain", lines)
+        names = "street, lidar, median measured / estimated [cm], off by [cm], held, out of domain"
+        show("The model's 90 % intervals", names, lines)
 
 
 def main(given: argparse.Namespace) -> None:
     """Run, judge, print."""
     table, lost = measured(given)
-    found = figures(table, lost, given.model)
+    found = figures(table, lost)
     tell(found)
     if given.json:
         given.json.write_text(json.dumps(found, indent=1) + "\n")

@@ -23,6 +23,7 @@ from tilestream.bounded_yaml import read_yaml
 from tilestream.config import Settings
 from tilestream.errors import TilestreamError, UsageError
 from tilestream.marks import unsealed
+from tilestream.model.file import save_model
 from tilestream.pipeline.engine.costs import core_hours
 from tilestream.pipeline.jobs.forecast import forecast
 from tilestream.pipeline.jobs.run_settings import Recipe
@@ -97,6 +98,9 @@ class Retraining(Settings):
     """`small`: 40 m of each path, to try it."""
     observe: VirtualSettings = VirtualSettings()
     """How the virtual drive is drawn: the same for all."""
+    real: str | None = None
+    """What `benchmarks/drives.py --model … --json` says of the model on real drives, for its card;
+    they judge and never train."""
 
     @model_validator(mode="after")
     def _named(self) -> Self:
@@ -190,10 +194,16 @@ def retrain(wanted: Retraining) -> str:
         names.append(name)
     folders = {name: f"{wanted.out}/runs/{name}" for name in names}
     path = f"{wanted.out}/{MODEL}"
-    model = ts.train_over(folders, recipe=wanted.recipe, seed=wanted.seed, judge=True, out=path)
+    model = ts.train_over(folders, recipe=wanted.recipe, seed=wanted.seed, judge=True)
+    if wanted.real is not None:
+        real = json.loads(Path(wanted.real).read_text(encoding="utf-8"))
+        model.card["checked"]["real drives"] = on_real_drives(real)
+    save_model(model, path)
     for lidar in model.card["lidars"]:
         print(f"trained over {lidar}")
     for name, told in model.card["checked"].items():
+        if "skill" not in told:
+            continue
         low, high = told["skill"][1:]
         print(
             f"{name}: {told['places']} places, skill {told['skill'][0]:.2f} ({low:.2f}-{high:.2f})"
@@ -201,6 +211,29 @@ def retrain(wanted: Retraining) -> str:
     spent = sum(_core_hours(folder) for folder in folders.values())
     print(f"{model.card['places']} places, {spent:.3f} core-hours without the simulation: {path}")
     return path
+
+
+def on_real_drives(found: dict[str, Any]) -> dict[str, Any]:
+    """The figures of real drives that a card keeps: places, streets, pooled rank correlation with
+    its interval, and by lidar the level (estimated / measured), by how much estimates are off [m]
+    and the share of the errors that the intervals hold, with its standard error.
+    """
+    streets = [name for name in found["pooled"] if name != "all"]
+    pooled = found["pooled"]["all"]
+    return {
+        "places": found["places"],
+        "streets": streets,
+        "spearman": [pooled["value"], pooled["low"], pooled["high"]],
+        "level": {
+            lidar: one["estimated"]["value"] / one["measured"]["value"]
+            for lidar, one in found["model"]["all"].items()
+        },
+        "mae": {lidar: one["off"]["value"] for lidar, one in found["model"]["all"].items()},
+        "coverage": {
+            lidar: [one["held"]["value"], one["held"]["standard_error"]]
+            for lidar, one in found["model"]["all"].items()
+        },
+    }
 
 
 def _core_hours(folder: str) -> float:
