@@ -36,7 +36,11 @@ class Frontier:
         self._refused: deque[Outcome] = deque()
 
     def add(self, tasks: Iterable[Task]) -> None:
-        """Take more tasks, each after those that it needs; a need that is not known is done."""
+        """Take more tasks, each after those that it needs; a need that is not known is done.
+
+        Those that may run at once come first, in their order: they have just become possible.
+        """
+        ready: list[Task] = []
         for task in tasks:
             all_needs = task.needs
             failed = [self._failed[need] for need in all_needs if need in self._failed]
@@ -48,9 +52,10 @@ class Frontier:
             if needs:
                 self._open[task.key] = len(needs)
             else:
-                self._ready.append(task)
+                ready.append(task)
             for need in needs:
                 self._after.setdefault(need, []).append(task)
+        self._ready.extendleft(reversed(ready))
 
     @property
     def idle(self) -> bool:

@@ -45,11 +45,15 @@ Inventory = Mapping[str, Entry]
 """By the name of the file."""
 
 
-def announce(tasks: Iterable[Task]) -> None:
+def announce(tasks: Iterable[Task], *, begun: bool = False) -> None:
     """Write down the tables that tasks will make; others of their folders are removed.
 
     Only what an earlier inventory names is removed. The folders are made, so that one that cannot
     be is told before any work.
+
+    Args:
+        tasks: all that will write to these folders.
+        begun: some of them are running; the half-written files there may be theirs.
 
     Raises:
         UsageError: a folder is a file, or below one.
@@ -61,7 +65,8 @@ def announce(tasks: Iterable[Task]) -> None:
             folder.make()
         except (FileExistsError, NotADirectoryError):
             raise UsageError(f"{place} is a file, or below one: name another folder") from None
-        folder.remove_parts()
+        if not begun:
+            folder.remove_parts()
         for name in inventory_of(place):
             if name not in entries:
                 folder.under(name).remove()
