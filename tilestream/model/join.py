@@ -22,6 +22,16 @@ LONE = "the only label of its path"
 """Why a label alone on its path is lost."""
 NOWHERE = "no factors at its place"
 """Why a label is lost whose place could not be looked from."""
+FAILED = "label failed"
+"""Why a label is lost that was not measured."""
+KEPT_BY = {
+    FAILED: "a scan there with enough points, over a part of the map that is mapped",
+    NOWHERE: "the height and the mount of the lidar as they are, and the map around its place",
+    LONE: "a second label on its path: a longer drive, or a route along this one",
+}
+"""What would keep a label that is lost, by the reason."""
+NOT_A_NUMBER = "more of the map around its place, or of the scan there"
+"""What would keep one of which a value is not known."""
 
 
 def join(
@@ -126,7 +136,7 @@ def _joined(group: str, factors: pd.DataFrame | None, labels: pd.DataFrame) -> p
     why = table["reason"].fillna("its task failed").astype(str).to_numpy(object)
     return table.assign(
         group=group,
-        reason=np.where(failed, "label failed", np.where(blind, NOWHERE, "")),
+        reason=np.where(failed, FAILED, np.where(blind, NOWHERE, "")),
         detail=np.where(failed, table["label_reason"].astype(str), np.where(blind, why, "")),
     ).drop(columns=["label_status", "label_reason", "status"])
 

@@ -8,6 +8,7 @@ import pandas as pd
 
 from tilestream.errors import SourceError
 from tilestream.model.dataset import Dataset
+from tilestream.model.join import KEPT_BY, NOT_A_NUMBER
 from tilestream.notes import MATCHER, noticed
 from tilestream.pipeline.engine.outputs import Parquet
 from tilestream.pipeline.jobs.along_routes import off_map
@@ -105,8 +106,8 @@ def _labels_by_drive(done: Done) -> dict[str, pd.DataFrame]:
 
 
 def lost_labels(dataset: Dataset | None) -> list[dict[str, Any]]:
-    """The labels that no model can learn from: `reason`, `count`, and in `detail` the commonest of
-    what is known besides; the commonest reason first.
+    """The labels that no model can learn from: `reason`, `count`, in `detail` the commonest of what
+    is known besides, and `kept_by`, what would have kept them; the commonest reason first.
     """
     if dataset is None or dataset.lost.empty:
         return []
@@ -115,5 +116,7 @@ def lost_labels(dataset: Dataset | None) -> list[dict[str, Any]]:
         detail = rows["detail"].astype(str).value_counts()
         more = f" (and {len(detail) - 1:,} others)" if len(detail) > 1 else ""
         told = str(detail.index[0]) + more if detail.index[0] else ""
-        found.append({"reason": str(reason), "count": len(rows), "detail": told})
+        keeps = KEPT_BY.get(str(reason), NOT_A_NUMBER)
+        lost = {"reason": str(reason), "count": len(rows), "detail": told, "kept_by": keeps}
+        found.append(lost)
     return sorted(found, key=lambda lost: (-int(str(lost["count"])), str(lost["reason"])))
