@@ -17,7 +17,9 @@ from tilestream.pipeline.engine.costs import core_hours
 from tilestream.pipeline.engine.plan import Plan, megabytes
 from tilestream.pipeline.jobs.forecast import Forecast
 from tilestream.report.drives import DriveMeasured
+from tilestream.report.formatting import cm_about
 from tilestream.report.paper_tables import LIMITS
+from tilestream.report.summary import digits_of
 from tilestream.store import POINTS, TileStore
 
 
@@ -234,7 +236,8 @@ def report_table(report: dict[str, Any], figures: Sequence[tuple[str, str]]) -> 
         table.add_row(*(" ".join(text.split()) for text in (figure, meaning)))  # plain spaces
     for worst in report["worst"][:3]:
         where = f"on {worst['route_id']} at {worst['arc_length']:.0f} m, of the worst places"
-        table.add_row(f"{worst['estimate'] * 100:.1f} cm", where)
+        estimate = cm_about(worst["estimate"], digits_of(report))
+        table.add_row(" ".join(estimate.split()), where)
     return table
 
 

@@ -14,6 +14,7 @@ from tilestream.model.training import PREDICTION_COLUMNS
 from tilestream.notes import Notes
 from tilestream.records import Float64
 from tilestream.report.drives import DriveMeasured
+from tilestream.report.worth import Worth
 
 PLACE_COLUMNS = ("route_id", "sample", "arc_length", "heading", "x", "y", "z")
 """Where a sample point is: its route, its number there, and the map frame [m, rad]."""
@@ -77,7 +78,9 @@ class Findings:
     drives: tuple[DriveMeasured, ...] = ()
     """How much of each drive was measured."""
     lost_labels: Sequence[Mapping[str, Any]] = ()
-    """The labels that no model can learn from: `reason`, `count`, `detail`."""
+    """The labels that no model can learn from: `reason`, `count`, `detail`, `kept_by`."""
+    worth: Worth | None = None
+    """What the estimates are worth; None: nobody has said it."""
     cell_size: float | None = None
     """Edge of the cells that labels were measured with [m]; None: not known."""
     crs: str | None = None

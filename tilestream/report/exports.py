@@ -98,12 +98,17 @@ def write_geoparquet(file: Files, found: Findings) -> None:
     geo = {"version": GEOPARQUET, "primary_column": "geometry", "columns": {"geometry": geometry}}
     table = pa.Table.from_pandas(found.places, preserve_index=False)
     table = table.append_column("geometry", pa.array(_wkb(at, placed), pa.binary()))
-    schema = pa.schema(
-        [_documented(field) for field in table.schema], {b"geo": json.dumps(geo).encode()}
-    )
+    about = {b"geo": json.dumps(geo).encode()}
+    about |= {b"worth": _worth(found).encode()} if found.worth else {}
+    schema = pa.schema([_documented(field) for field in table.schema], about)
     buffer = io.BytesIO()
     pq.write_table(table.cast(schema), buffer, compression="zstd")
     file.write(buffer.getvalue())
+
+
+def _worth(found: Findings) -> str:
+    """What the estimates are worth as one line; empty: nobody has said it."""
+    return "" if found.worth is None else " ".join(found.worth.told)
 
 
 def _wkb(at: Float64, placed: np.ndarray[Any, np.dtype[np.bool_]]) -> list[bytes | None]:
@@ -160,6 +165,7 @@ def write_geojson(file: Files, found: Findings, threshold: float) -> None:
         "name": "over_threshold",
         "threshold": threshold,
         "coordinates": degrees if crs is not None else "map frame [m]; the map names no CRS",
+        **({"worth": _worth(found)} if found.worth else {}),
         "features": features,
     }
     write_json(file, collection)
@@ -172,21 +178,23 @@ def _crs(name: str | None) -> CRS | None:
         raise CrsError(f"{name!r} is no CRS that pyproj knows ({error})") from error
 
 
-def write_cloud(file: Files, places: pd.DataFrame) -> int:
+def write_cloud(file: Files, found: Findings) -> int:
     """Write the sample points as PCD, coloured as on the map (`rgb` as PCL packs it), with their
-    `estimate` [m]; grey and NaN where there is none.
+    `estimate` [m]; grey and NaN where there is none. A comment says what they are worth.
 
     Returns:
         How many places have no position and are not in it.
     """
-    at = places[["x", "y", "z"]].to_numpy(np.float64)
+    at = found.places[["x", "y", "z"]].to_numpy(np.float64)
     placed = np.isfinite(at).all(axis=1)
-    estimate = estimates(places)
+    estimate = estimates(found.places)
     rgb = scale_of(estimate).rgb(estimate[placed]).astype(np.uint32)
     packed = (rgb[:, 0] << 16) | (rgb[:, 1] << 8) | rgb[:, 2]
     fields = {
         "rgb": packed.view(np.float32),
         "estimate": estimate[placed].astype(np.float32),
     }
-    write_pcd(file.address, at[placed], fields=fields)
+    write_pcd(
+        file.address, at[placed], fields=fields, comments=[_worth(found)] if found.worth else []
+    )
     return int((~placed).sum())

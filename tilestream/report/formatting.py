@@ -1,5 +1,6 @@
 """Figures as a person reads them: for the templates, the charts, and the command line."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -23,11 +24,28 @@ def cm(metres: Any, digits: int = 1) -> str:
     return f"{metres * CM_PER_M:.{digits}f}{_GLUE}cm" if known(metres) else NONE
 
 
-def cm_span(low: Any, high: Any) -> str:
-    """An interval in centimetres."""
+def cm_about(metres: Any, digits: int | None) -> str:
+    """An estimate in centimetres, with as many significant digits as it deserves; None: with a
+    digit behind the point.
+    """
+    if digits is None or not known(metres):
+        return cm(metres)
+    return f"{_significant(metres * CM_PER_M, digits)}{_GLUE}cm"
+
+
+def _significant(value: float, digits: int) -> str:
+    """A number with so many significant digits, and zeros behind them: 123.4 with two is 120."""
+    rounded = float(f"{value:.{digits - 1}e}")
+    before = math.floor(math.log10(abs(rounded))) + 1 if rounded else 1
+    return f"{rounded:.{max(digits - before, 0)}f}"
+
+
+def cm_span(low: Any, high: Any, digits: int | None = None) -> str:
+    """An interval in centimetres; digits as of `cm_about`."""
     if not (known(low) and known(high)):
         return NONE
-    return f"{low * CM_PER_M:.1f} to {high * CM_PER_M:.1f}{_GLUE}cm"
+    ends = (cm_about(end, digits).removesuffix(f"{_GLUE}cm") for end in (low, high))
+    return f"{' to '.join(ends)}{_GLUE}cm"
 
 
 def cm_by_name(lengths: Mapping[Any, Any], names: Sequence[str]) -> str:

@@ -20,7 +20,7 @@ from tilestream.report.data import AROUND, Findings
 from tilestream.report.drives import EVALUATED
 from tilestream.report.pictures import ABOVE, BELOW, heights_ramp
 from tilestream.report.segments import APART, BRIDGE
-from tilestream.report.summary import AXES, STARTS, cards
+from tilestream.report.summary import AXES, STARTS, cards, digits_of
 
 MOST_ROUTES = 40
 """Routes that the page lists, the worst by their 95 % quantile; `report.json` has all."""
@@ -44,8 +44,9 @@ def _environment() -> Environment:
     )
     environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
     filters = (
-        formatting.cm, formatting.cm_by_name, formatting.percent, formatting.number,
-        formatting.distance, formatting.thousands, formatting.megabytes, formatting.fact,
+        formatting.cm, formatting.cm_about, formatting.cm_by_name, formatting.percent,
+        formatting.number, formatting.distance, formatting.thousands, formatting.megabytes,
+        formatting.fact,
     )  # fmt: skip
     environment.filters |= {function.__name__: function for function in filters}
     environment.filters["base64"] = lambda data: base64.b64encode(data).decode("ascii")
@@ -82,6 +83,7 @@ def report_page(
         [charts.city_map(found, tip)]
         + [charts.path_chart(found, path["path"], f"path-{k}") for k, path in enumerate(paths)],
         cards=cards(content),
+        digits=digits_of(content),
         routes=_listed_routes(content["routes"]),
         segments=segments[:MOST_SEGMENTS],
         paths=paths,

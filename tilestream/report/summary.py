@@ -12,7 +12,7 @@ from tilestream.model.figures import with_spans
 from tilestream.model.training import PREDICTION_COLUMNS
 from tilestream.records import Float64, Int64
 from tilestream.report.data import PLACE_COLUMNS, Findings, estimates, like_training
-from tilestream.report.formatting import cm, distance, known, percent, thousands
+from tilestream.report.formatting import cm, cm_about, distance, known, percent, thousands
 from tilestream.report.paper_tables import paper_table_i, paper_table_iii, table_i, table_iii
 from tilestream.report.segments import reaches, segments, worst_measured, worst_places
 from tilestream.version import VERSION
@@ -38,6 +38,7 @@ def summary(found: Findings, threshold: float) -> dict[str, Any]:
         "tilestream": VERSION,
         "threshold": threshold,
         "crs": found.crs,
+        "worth": None if found.worth is None else found.worth.plain(),
         "headline": headline(found.places, threshold) | {"labelled": len(found.labels)},
         "routes": routes(found.places, threshold),
         "segments": [segment(found.places, rows) for rows in runs],
@@ -118,6 +119,7 @@ def cards(content: Mapping[str, Any]) -> list[tuple[str, str]]:
         content: `summary`, or what `report.json` has of it.
     """
     head, limit = content["headline"], cm(content["threshold"], 0)
+    digits = digits_of(content)
     unlike = (percent(head["outside_share"]), "of the places unlike the training places")
     over = f"of the places over {limit}: {distance(head['over_length'])} of road"
     drives = content["drives"]
@@ -127,9 +129,9 @@ def cards(content: Mapping[str, Any]) -> list[tuple[str, str]]:
     missing = f"places without an estimate ({percent(head['missing_share'])})"
     return [
         (distance(head["length"]), f"of road, {thousands(head['places'])} sample points"),
-        (cm(head["median"]), "median estimated error"),
-        (cm(head["p95"]), "95 % of the places are estimated below this"),
-        (cm(head["max"]), "the highest estimate"),
+        (cm_about(head["median"], digits), "median estimated error"),
+        (cm_about(head["p95"], digits), "95 % of the places are estimated below this"),
+        (cm_about(head["max"], digits), "the highest estimate"),
         (percent(head["over_share"]), over),
         *([unlike] if known(head["outside_share"]) else []),
         (evaluated, "places evaluated"),
@@ -137,6 +139,14 @@ def cards(content: Mapping[str, Any]) -> list[tuple[str, str]]:
         (thousands(head["labelled"]), "measured errors to train on and to judge by"),
         (thousands(head["missing"]), missing),
     ]
+
+
+def digits_of(content: Mapping[str, Any]) -> int | None:
+    """With how many significant digits estimates are told; None: nobody has said what they are
+    worth.
+    """
+    worth = content.get("worth")
+    return None if worth is None else int(worth["digits"])
 
 
 def routes(places: pd.DataFrame, threshold: float) -> list[dict[str, Any]]:

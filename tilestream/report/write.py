@@ -62,7 +62,7 @@ def write_report(
     write_geoparquet(place.under("places.parquet"), findings)
     write_geojson(place.under("over_threshold.geojson"), findings, threshold)
     write_csv(place.under("places.csv"), findings.places)
-    content["not_in_cloud"] = write_cloud(place.under("map.pcd"), findings.places)
+    content["not_in_cloud"] = write_cloud(place.under("map.pcd"), findings)
     worst = {n: _picture(findings, at) for n, at in enumerate(content["worst"], start=1)}
     ends = _ends(findings, content["worst_measured"])
     content["figures"] = _write_figures(place.under("figures"), findings, worst, ends)

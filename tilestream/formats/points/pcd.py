@@ -7,7 +7,7 @@ the compression of the third encoding: it is a kernel (`kernels/lzf.py`).
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
@@ -318,6 +318,7 @@ def write_pcd(
     *,
     fields: dict[str, ArrayLike] | None = None,
     encoding: Encoding = "binary",
+    comments: Sequence[str] = (),
 ) -> None:
     """Write points as PCD; the file takes its name only once it is whole.
 
@@ -327,6 +328,7 @@ def write_pcd(
             float64.
         fields: further values per point, (n,) each, written with their own type.
         encoding: how the points are written.
+        comments: lines of the header that programs pass over.
 
     Raises:
         UsageError: shapes or types that do not fit, or an encoding that PCD does not have.
@@ -341,15 +343,16 @@ def write_pcd(
     else:
         raise UsageError(f"encoding {encoding!r}: give ascii, binary or binary_compressed")
     with Files.at(path).writing() as file:
-        file.write(_header_of(table, encoding))
+        file.write(_header_of(table, encoding, comments))
         file.write(data)
 
 
-def _header_of(table: NDArray[Any], encoding: str) -> bytes:
+def _header_of(table: NDArray[Any], encoding: str, comments: Sequence[str]) -> bytes:
     names = table.dtype.names or ()
     types = [table.dtype[name] for name in names]
     lines = (
         "# .PCD v0.7 - Point Cloud Data file format",
+        *(f"# {' '.join(line.split())}" for line in comments),
         "VERSION 0.7",
         "FIELDS " + " ".join(names),
         "SIZE " + " ".join(str(t.itemsize) for t in types),
