@@ -71,6 +71,12 @@ def test_a_real_drive(name: str, shared_data: Path, tmp_path: Path, command: Com
     compared = command.found("compare", store, *route, *ranges, "--out", tmp_path / "c")
     assert all(choice["estimated"] > 0 for choice in compared["choices"])
 
+    vehicle = ["--sensor", "HDL64", *HEIGHT, "--range-max", "60"]
+    alone = ["estimate", log, "--every", "2", *vehicle, "--spacing", "20", "--model", "physics"]
+    answer = command.found(*alone, "--workers", "1", "--out", tmp_path / "e")
+    assert answer["headline"]["estimated"] == answer["headline"]["places"] > 2
+    assert answer["worth"]["checked"] == "nowhere"
+
     job = {
         "out": str(tmp_path / "run"),
         "map": {"sources": [str(log)], "every": 2},

@@ -47,7 +47,7 @@ from tilestream.pipeline.engine.cluster import dask_client
 from tilestream.pipeline.engine.costs import calibration_file, core_hours, learn
 from tilestream.pipeline.engine.outputs import TileArrays
 from tilestream.pipeline.engine.stage import Task
-from tilestream.pipeline.jobs import run as main_job
+from tilestream.pipeline.jobs import run_story
 from tilestream.pipeline.jobs.forecast import forecast
 from tilestream.pipeline.jobs.run_book import Book
 from tilestream.pipeline.jobs.run_inputs import check_model, inputs_of, making_of
@@ -988,7 +988,7 @@ def test_dask_makes_the_same_tables(inputs: Path, tmp_path: Path) -> None:
 def test_many_places_are_learnt_by_all_workers(
     inputs: Path, done: tuple[Path, Told], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(main_job, "LARGE", 10)
+    monkeypatch.setattr(run_story, "LARGE", 10)
     with dask_client(None, 2, 1_500_000_000) as client:
         ts.run(job(inputs, tmp_path / "run"), client)
     one, two = (

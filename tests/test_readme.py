@@ -1,5 +1,6 @@
 """What the README shows works."""
 
+import json
 import re
 from pathlib import Path
 
@@ -95,8 +96,25 @@ def over(limit: float) -> bool:
     return bool(estimates.max() > limit)
 
 
+def test_the_map_block_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_las(tmp_path / "map.laz", street_of("canyon", 1, 0.3))
+    line = {"type": "LineString", "coordinates": [[8.0, 0.0], [34.0, 0.0]]}
+    route = {"type": "Feature", "properties": {"route_id": "street"}, "geometry": line}
+    (tmp_path / "route.geojson").write_text(json.dumps(route))
+    program, *arguments = block("tilestream estimate").split("#")[0].split()
+    assert program == "tilestream"
+    few = ["--spacing", "12", "--range-max", "14", "--workers", "1"]
+    assert run([*arguments, *few]) == 0
+    assert "What these estimates are worth" in capsys.readouterr().out
+    assert (tmp_path / "tilestream-estimate" / "report" / "index.html").is_file()
+
+
 def test_no_block_is_left_out() -> None:
     ran = {"import tilestream as ts", "--blind-rear-deg", "tilestream template"}
+    ran |= {"tilestream estimate"}
     setups = {"tilestream demo", "pytest"}
     for _, text in BLOCKS:
         assert sum(part in text for part in ran | setups) == 1

@@ -27,6 +27,7 @@ from tilestream.settings import (
     ReportSettings,
     SimulateSettings,
     StartSettings,
+    VirtualSettings,
 )
 from tilestream.simulation.settings import SimulationSettings
 
@@ -40,6 +41,7 @@ GROUPS: tuple[type[Settings], ...] = (
     ReportSettings,
     SimulateSettings,
     SimulationSettings,
+    VirtualSettings,
 )
 OWN = {
     ("compare", "spacing"): "a comparison needs fewer places than an estimate",
@@ -50,7 +52,7 @@ OWN = {
 """Options that share a setting's name and have a default of their own."""
 FILES = {"store", "folder", "name", "sources", "city", "log"}
 """What a command works on: no settings of it, whatever a job's file calls so."""
-JOBS = (ts.ingest, ts.localize, ts.factors_along, ts.observe_along, compare)
+JOBS = (ts.estimate, ts.ingest, ts.localize, ts.factors_along, ts.observe_along, compare)
 
 
 def options() -> Iterator[tuple[str, Any]]:
@@ -93,6 +95,9 @@ def test_the_commands_have_settings_as_options() -> None:
         ("localize", "matcher"),
         ("factors", "sensor"),
         ("compare", "matcher"),
+        ("estimate", "blind_rear_deg"),
+        ("estimate", "matcher"),
+        ("estimate", "sensor_height"),
         ("simulate", "seed"),
     ):
         assert (command, name) in found

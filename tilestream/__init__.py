@@ -60,6 +60,7 @@ from tilestream.version import VERSION
 if TYPE_CHECKING:
     from tilestream.apps.view import view as view
     from tilestream.definitions import explain as explain
+    from tilestream.pipeline.jobs.estimate import estimate as estimate
     from tilestream.pipeline.jobs.run import dataset as dataset
     from tilestream.pipeline.jobs.run import run as run
     from tilestream.pipeline.jobs.run_settings import RunSettings as RunSettings
@@ -72,6 +73,8 @@ def __getattr__(name: str) -> Any:
     """
     if name in ("run", "dataset"):
         return getattr(import_module("tilestream.pipeline.jobs.run"), name)
+    if name == "estimate":
+        return import_module("tilestream.pipeline.jobs.estimate").estimate
     if name == "train_over":
         return import_module("tilestream.pipeline.jobs.train_over").train_over
     if name == "view":

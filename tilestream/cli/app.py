@@ -33,6 +33,10 @@ TERMINATED = 143
 MAKE_ROOM = ": make room; the same command continues where it was"
 MARKUP: Any = "markdown"  # the other mode takes [m] for a style
 COMMANDS = {
+    "estimate": (
+        "jobs",
+        "From a map alone to the localization error everywhere, and its report: begin here.",
+    ),
     "ingest": ("maps", "Make a tile store from point clouds, map directories and logs of drives."),
     "status": ("maps", "Show the tiles of a store: counts, extents, status and reasons."),
     "verify": (
@@ -118,6 +122,8 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=MARKUP,
+    epilog="Begin with `tilestream estimate map.pcd --route route.tum`, or with `tilestream demo`, "
+    "which needs no files.",
 )
 for _name, (_, _told) in COMMANDS.items():
     app.command(_name, help=_told)(lambda: None)  # only listed

@@ -14,18 +14,28 @@ from tilestream.cli.options import AsJson, Changes, Config, DryRun
 from tilestream.cli.printing import err, out, print_json, say, say_notes
 from tilestream.cli.progress import progress
 from tilestream.cli.tables import forecast_rows, forecast_table, plan_table, report_table
-from tilestream.errors import LimitError
+from tilestream.errors import LimitError, PartialError
 from tilestream.files import Files
 from tilestream.pipeline.jobs import run as main_job
 from tilestream.pipeline.jobs import simulate as simulation
+from tilestream.pipeline.jobs.estimate import OUT, estimate_settings
 from tilestream.pipeline.jobs.forecast import forecast
+from tilestream.pipeline.jobs.run_book import RECORD, told_before
 from tilestream.pipeline.jobs.run_inputs import extent
 from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
 from tilestream.pipeline.stages.simulated import SCENE_BYTES
 from tilestream.report import cards, gate
 from tilestream.report.drives import EVALUATED, DriveMeasured
 from tilestream.report.segments import MISSING, check_threshold
-from tilestream.settings import SimulateSettings
+from tilestream.settings import (
+    LabelSettings,
+    LogSettings,
+    MapSettings,
+    PlaceSettings,
+    ReportSettings,
+    SimulateSettings,
+    VirtualSettings,
+)
 from tilestream.simulation.settings import SimulationSettings, load_preset
 
 SHIPPED = resources.files("tilestream") / "data"
@@ -36,18 +46,87 @@ def template() -> None:
     out.out((SHIPPED / "city.yaml").read_text(), end="", highlight=False)
 
 
+FailOver = Annotated[
+    float | None,
+    typer.Option(
+        help="Exit with 1 if any estimate is above this [m], if less than "
+        f"{EVALUATED:.0%} of a drive or of the places of a route were evaluated, or if more "
+        f"than {MISSING:.0%} of all places have no estimate."
+    ),
+]
+
+
+@on_cluster
+@with_settings
+def estimate(
+    sources: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="MAP",
+            help="Files, globs, a map directory, logs of a survey; or a tile store alone.",
+        ),
+    ],
+    places: Annotated[
+        PlaceSettings,
+        fields(
+            *("sensor", "sensor_height", "spacing", "project_to", "route_z", "cell_size"),
+            "memory",
+        ),
+    ],
+    seeing: Annotated[VirtualSettings, fields("range_max", "blind_rear_deg")],
+    labels: Annotated[LabelSettings, fields("matcher")],
+    which_map: Annotated[MapSettings, fields("crs", "partial", *LogSettings.model_fields)],
+    report: Annotated[ReportSettings, fields("threshold", "title")],
+    route: Annotated[
+        list[str],
+        typer.Option(
+            help="TUM, KITTI, CSV, GeoJSON, Lanelet2 or a log; several times; default: all lanes "
+            "of the map, else the way of the logs that it is made of."
+        ),
+    ] = [],  # noqa: B006 - typer's way to say none
+    model: Annotated[
+        str | None,
+        typer.Option(
+            help="A model file; shipped: the one that comes with tilestream; physics: the virtual "
+            "drive as it is.",
+            show_default="shipped, where one is",
+        ),
+    ] = None,
+    folder: Annotated[str, typer.Option("--out", help="The run directory.")] = OUT,
+    fail_over: FailOver = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="As `plan`.")] = False,
+    as_json: AsJson = False,
+    cluster: Cluster = ALL_CORES,
+) -> None:
+    """From a map alone to the localization error everywhere: nobody has to drive there first.
+
+    - `tilestream estimate map/`: all lanes of a map directory of Autoware
+
+    - `tilestream estimate map.laz --route route.geojson --sensor HDL64 --sensor-height 1.73`
+
+    - `tilestream estimate drive.mcap --every 2`: the streets of a survey, from its log
+
+    - `tilestream estimate map.zarr --route lanelet2_map.osm --fail-over 0.25`: a gate
+
+    It ends by printing what the estimates are worth, the headline, and where the report is. The
+    same command continues a job that was stopped. `tilestream run` learns from drives too.
+    """
+    if fail_over is not None:
+        check_threshold(fail_over)
+    settings = estimate_settings(
+        sources, route, folder, model, places, seeing, labels, which_map, report
+    )
+    if dry_run:
+        show_plan(settings, as_json)
+    else:
+        do_and_tell(settings, cluster, fail_over, as_json)
+
+
 @on_cluster
 def run(
     config: Config,
-    changes: Changes = [],  # noqa: B006 - typer's way to say none
-    fail_over: Annotated[
-        float | None,
-        typer.Option(
-            help="Exit with 1 if any estimate is above this [m], if less than "
-            f"{EVALUATED:.0%} of a drive or of the places of a route were evaluated, or if more "
-            f"than {MISSING:.0%} of all places have no estimate."
-        ),
-    ] = None,
+    changes: Changes = [],  # noqa: B006
+    fail_over: FailOver = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="As `plan`.")] = False,
     as_json: AsJson = False,
     cluster: Cluster = ALL_CORES,
@@ -55,14 +134,37 @@ def run(
     """The main job: from map and drives to the estimated error everywhere, and its report."""
     if fail_over is not None:
         check_threshold(fail_over)
+    settings = read_settings(config, changes)
     if dry_run:
-        plan(config, changes, as_json=as_json)
-        return
-    folder = do_job(read_settings(config, changes), cluster)
+        show_plan(settings, as_json)
+    else:
+        do_and_tell(settings, cluster, fail_over, as_json)
+
+
+def do_and_tell(
+    settings: RunSettings, cluster: Cluster, fail_over: float | None, as_json: bool
+) -> None:
+    """Run the main job, print its headline, and close the gate where one is asked for.
+
+    What failed is told after the headline of what is done.
+
+    Raises:
+        PartialError: some of the work failed; lists it.
+        LimitError: the gate is closed.
+    """
+    failed: PartialError | None = None
+    try:
+        folder = do_job(settings, cluster)
+    except PartialError as error:
+        folder, failed = settings.folder, error
+        if "report" not in told_before(folder.under(RECORD)):  # of this call there is none
+            raise
     if as_json:
         print_json(report_of(folder))
     else:
         show_report(folder)
+    if failed is not None:
+        raise failed
     if fail_over is not None:
         require_within(folder, fail_over)
 
@@ -80,8 +182,12 @@ def report_of(folder: Files) -> dict[str, Any]:
 
 
 def show_report(folder: Files) -> None:
-    """Print the headline of a report and where it is."""
+    """Print what the estimates of a report are worth, its headline and where it is."""
     report = report_of(folder)
+    if report["worth"] is not None:
+        say("What these estimates are worth:")
+        for sentence in report["worth"]["told"]:
+            say(f"  {sentence}")
     out.print(report_table(report, cards(report)))
     say(f"The matcher is {report['facts']['matcher']['name']}")
     for line in [*hardly_measured(report), *lost_labels(report)]:
@@ -111,7 +217,9 @@ def lost_labels(report: dict[str, Any]) -> list[str]:
     total = sum(one["count"] for one in lost)
     of = total + report["headline"]["labelled"]
     reasons = [
-        f"  {one['count']:,} {one['reason']}" + (f": {one['detail']}" if one["detail"] else "")
+        f"  {one['count']:,} {one['reason']}"
+        + (f": {one['detail']}" if one["detail"] else "")
+        + (f"; would be kept by {one['kept_by']}" if one.get("kept_by") else "")
         for one in lost
     ]
     return [f"{total:,} of {of:,} measured places are not used:", *reasons]
@@ -139,7 +247,12 @@ def plan(
     as_json: AsJson = False,
 ) -> None:
     """What a job would run: stages, tasks, memory, core-hours; reads headers, writes nothing."""
-    expected = forecast(read_settings(config, changes))
+    show_plan(read_settings(config, changes), as_json)
+
+
+def show_plan(settings: RunSettings, as_json: bool) -> None:
+    """Print what a job would run."""
+    expected = forecast(settings)
     rows = forecast_rows(expected)
     if as_json:
         print_json({"stages": rows, "notes": expected.notes})

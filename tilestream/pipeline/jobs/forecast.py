@@ -12,6 +12,7 @@ from tilestream.notes import MATCHER, Notes, noticed
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.stage import Task
 from tilestream.pipeline.jobs.along_routes import off_map
+from tilestream.pipeline.jobs.estimator import estimator_of
 from tilestream.pipeline.jobs.ingest import plan_ingest, store_settings
 from tilestream.pipeline.jobs.run_inputs import (
     Inputs,
@@ -65,11 +66,13 @@ def forecast(settings: RunSettings) -> Forecast:
     inputs = with_logs(settings, inputs, sources)
     measure = plan_measure(settings, inputs, map_plan)
     done = [Outcome(task.key, task.stage) for task in measure.tasks]
-    estimate = plan_estimate(settings, map_plan.store.grid, measure, done)
+    by = estimator_of(settings, sum(task.work for task in measure.outputs("label")))
+    estimate = plan_estimate(settings, map_plan.store.grid, measure, done, by)
     tasks = (*reading, *measure.tasks, *estimate.tasks)
     far = {"routes": off_map(map_plan.points, map_plan.store.grid, inputs.routes)}
     lost = [f"{name} is left out: {reason}" for name, reason in measure.left_out.items()]
-    own = {PLAN: lost, MATCHER: settings.label.registration.notes}
+    few = [by.few] if by.few else []
+    own = {PLAN: [*few, *lost], MATCHER: settings.label.registration.notes}
     return Forecast(tasks, noticed(notes, inputs.notes, far, own))
 
 

@@ -9,28 +9,26 @@ simulate? -> scatter -> merge, cells, terms, factors, surfels, observe, register
 
 import json
 import os
+from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import joblib
 import yaml
 
 from tilestream.errors import PartialError
-from tilestream.files import Files, place_of
+from tilestream.files import place_of
 from tilestream.lock import only_writer
 from tilestream.model.dataset import Dataset
 from tilestream.model.file import load_model
+from tilestream.model.shipped import file_of
 from tilestream.notes import noticed
-from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.cluster import report_kept
 from tilestream.pipeline.engine.costs import learn
 from tilestream.pipeline.engine.executor import Watch, execute
-from tilestream.pipeline.engine.plan import Plan, paths_of
-from tilestream.pipeline.engine.stage import Task
-from tilestream.pipeline.jobs.ingest import Reading
-from tilestream.pipeline.jobs.inventory import announce, settle, withdraw
+from tilestream.pipeline.jobs.estimator import Estimator
+from tilestream.pipeline.jobs.inventory import settle
 from tilestream.pipeline.jobs.run_book import (
     RECORD,
     Book,
@@ -45,7 +43,6 @@ from tilestream.pipeline.jobs.run_inputs import (
     Inputs,
     check_model,
     inputs_of,
-    read_map,
     seen_otherwise,
 )
 from tilestream.pipeline.jobs.run_notes import (
@@ -53,19 +50,13 @@ from tilestream.pipeline.jobs.run_notes import (
     log_poses_told,
     lost_labels,
     run_notes,
-    with_logs,
 )
-from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
 from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
+from tilestream.pipeline.jobs.run_story import Story, estimate_large
 from tilestream.pipeline.jobs.starts_of import starts_of
-from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.samples import DatasetFile
 from tilestream.report import write_report
 from tilestream.report.summary import plain
-from tilestream.store import TileStore, open_store
-
-LARGE = 50_000
-"""Measured places from which on a forest is grown by all workers together."""
 
 
 def run(
@@ -121,16 +112,14 @@ def _run(settings: RunSettings, client: Any | None, watch: Watch | None) -> None
         with report_kept(client, settings.folder.under("dask-performance.html").address):
             inputs = inputs_of(settings, client, watch)
             book.failures |= inputs.failures
-            story = _Story(settings, inputs, book)
+            story = Story(settings, inputs, book)
             inputs = story.inputs
             book.facts["notes"] = dict(inputs.notes)
             shared = [settings.out, story.store.url]
             first = story.first()
             execute(first, client, book.listening(watch), grow=story.grown, shared=shared)
-            if story.estimate is None:
-                story.estimate = story.plan_estimate()
-                book.tasks += story.estimate.tasks
-                _estimate_large(story.estimate, client, book.listening(watch))
+            if story.large is not None:
+                estimate_large(story.large, client, book.listening(watch))
         learn(book.tasks, book.outcomes)
         settle(book.tasks, book.failures)
         book.facts["notes"] = run_notes(settings, inputs, story.store)
@@ -168,121 +157,7 @@ def _begin(settings: RunSettings) -> Book:
     return Book(settings.folder, told_before(settings.folder.under(RECORD)))
 
 
-class _Story:
-    """The job as it goes on: what is known after each part decides what the next one is."""
-
-    def __init__(self, settings: RunSettings, inputs: Inputs, book: Book) -> None:
-        self.settings = settings
-        self.book = book
-        self.reading: Reading | None = read_map(settings, inputs)
-        self.store: TileStore = (
-            self.reading.store if self.reading else open_store(settings.store_url)
-        )
-        found = self.reading.found if self.reading else None
-        sources = self.store.sources() if found is None else [source.record for source in found]
-        self.inputs = with_logs(settings, inputs, sources)
-        self.measure = Plan((), settings.memory)
-        self.estimate: Plan | None = None
-        """None: not planned yet, or to be grown by all workers together."""
-        self._tiles: set[str] = set()
-        self._open: set[str] = set()
-
-    def first(self) -> Plan:
-        """What to run first: read the sources, or measure on the map that is there."""
-        tasks = self.reading.first().tasks if self.reading else ()
-        if not tasks:
-            self._close_map()
-            partial = self.settings.map.partial
-            tasks = self._measured(MapPlan.of_store(self.store, partial=partial))
-        return Plan(self._known(tasks), self.settings.memory)
-
-    def grown(self, outcome: Outcome) -> tuple[Task, ...]:
-        """What is to be done now that a task has ended."""
-        merges = self.reading.grown(outcome) if self.reading else None
-        if merges is not None:
-            self._tiles = {task.key for task in merges}
-            if not merges:
-                self._close_map()  # which refuses sources without points
-            return self._known((*merges, *self._measured(MapPlan.of_merges(self.store, merges))))
-        if outcome.key in self._tiles:
-            self._tiles.remove(outcome.key)
-            if not self._tiles:
-                self._close_map()
-        self._open.discard(outcome.key)
-        if self._open or self._tiles or not self.measure.tasks or self.estimate is not None:
-            return ()
-        planned = self.plan_estimate()
-        if _is_large(planned):
-            return ()
-        self.estimate = planned
-        return self._known(planned.tasks)
-
-    def plan_estimate(self) -> Plan:
-        """What is learnt and estimated from what was measured."""
-        planned = plan_estimate(self.settings, self.store.grid, self.measure, self.book.outcomes)
-        announce(planned.tasks)
-        return planned
-
-    def _close_map(self) -> None:
-        """Record what the map was made from, as soon as its last tile is written."""
-        if self.reading is not None:
-            self.book.failures |= self.reading.close(self.book.outcomes)
-
-    def _measured(self, map_plan: MapPlan) -> tuple[Task, ...]:
-        """The tasks that measure; tables of other settings are removed before."""
-        self.measure = plan_measure(self.settings, self.inputs, map_plan)
-        self.book.failures |= self.measure.left_out
-        announce(self.measure.tasks)
-        _remove_other_groups(self.settings, self.measure)
-        self._open = {task.key for task in self.measure.tasks}
-        return self.measure.tasks
-
-    def _known(self, tasks: tuple[Task, ...]) -> tuple[Task, ...]:
-        self.book.tasks += tasks
-        return tasks
-
-
-def _remove_other_groups(settings: RunSettings, measure: Plan) -> None:
-    """Remove the tables of drives of other settings, so that two jobs are never mixed.
-
-    Those of a drive whose log cannot be read now are kept: they were hours of work, maybe.
-    """
-    kept = {name.removeprefix("drive ") for name in measure.left_out}
-    own = {path.rsplit("/", 1)[0] for path in paths_of(measure.tasks)}
-    for kind, below in (
-        ("errors", ""),
-        ("starts", ""),
-        ("drives", "/factors"),
-        ("drives", "/observability"),
-    ):
-        for group in Files.at(f"{settings.out}/tables/{kind}").names():
-            folder = f"{settings.out}/tables/{kind}/{group}{below}"
-            if folder not in own and group not in kept:
-                withdraw(folder)
-
-
-def _is_large(estimate: Plan) -> bool:
-    """Whether so many places were measured that all workers grow the forest together."""
-    places = sum(task.work for task in estimate.outputs("samples"))
-    return places >= LARGE and bool(estimate.outputs("train"))
-
-
-def _estimate_large(plan: Plan, client: Any | None, watch: Watch) -> None:
-    """Estimate with a forest that all workers grow together, through joblib: the same trees."""
-    first, trains = (Plan(plan.outputs(stage), plan.memory) for stage in ("samples", "train"))
-    outcomes = execute(first, client, watch)
-    if client is None:
-        outcomes += execute(trains, None, watch)
-    else:
-        with client.as_current(), joblib.parallel_config(backend="dask"):
-            outcomes += execute(trains, None, watch)
-    if all(outcome.ok for outcome in outcomes):
-        begun = {outcome.key for outcome in outcomes}
-        rest = tuple(task for task in plan.tasks if task.key not in begun)
-        execute(Plan(rest, plan.memory), client, watch)
-
-
-def _report(settings: RunSettings, inputs: Inputs, story: _Story, book: Book) -> None:
+def _report(settings: RunSettings, inputs: Inputs, story: Story, book: Book) -> None:
     """Gather what is done and write the report; without a single factor table there is none."""
     good = {outcome.key for outcome in book.outcomes if outcome.ok}
     done = Done(tuple(task for task in book.tasks if task.key in good))
@@ -290,7 +165,12 @@ def _report(settings: RunSettings, inputs: Inputs, story: _Story, book: Book) ->
     book.facts["drives"] = [drive.plain() for drive in measured]
     if not done.outputs("factors"):
         return
-    told = ({JOB: offset_told(done, settings)}, heights_told(done, settings), log_poses_told(done))
+    by = story.estimator
+    told = (
+        {JOB: offset_told(done, settings, by)},
+        heights_told(done, settings),
+        log_poses_told(done),
+    )
     book.facts["notes"] = noticed(book.facts["notes"], *told)
     known = done.dataset()
     if known is not None:
@@ -299,8 +179,9 @@ def _report(settings: RunSettings, inputs: Inputs, story: _Story, book: Book) ->
         done,
         story.store,
         known,
-        _facts(settings, inputs, book, known, done),
+        _facts(settings, inputs, book, known, _model_facts(settings, done, by)),
         settings,
+        by,
         seen_otherwise(settings, inputs.drives),
     )
     found = replace(
@@ -318,7 +199,11 @@ def _report(settings: RunSettings, inputs: Inputs, story: _Story, book: Book) ->
 
 
 def _facts(
-    settings: RunSettings, inputs: Inputs, book: Book, known: Dataset | None, done: Done
+    settings: RunSettings,
+    inputs: Inputs,
+    book: Book,
+    known: Dataset | None,
+    model: Mapping[str, Any],
 ) -> dict[str, Any]:
     """What a reader of the report must know of the run, and what makes the same figures again."""
     stages = {name: f"{row['core_seconds']:.1f} s" for name, row in book.stages().items()}
@@ -330,7 +215,7 @@ def _facts(
         "map": settings.store_url,
         "sensor": settings.vehicle.name,
         "labelled places": 0 if known is None else len(known),
-        "model": _model_facts(settings, done),
+        "model": model,
         "matcher": {
             "name": settings.label.registration.told,
             **settings.label.registration.model_dump(),
@@ -343,14 +228,14 @@ def _facts(
     }
 
 
-def _model_facts(settings: RunSettings, done: Done) -> dict[str, Any]:
+def _model_facts(settings: RunSettings, done: Done, by: Estimator) -> dict[str, Any]:
     """Where the model comes from, and how it was grown."""
     along = {"averaged along the route over [m]": done.width}
-    if settings.model.untrained(done.labelled):
+    if by.untrained:
         offset = settings.model.offset or 0.0
         return {"from": "none: the virtual drive as it is", "offset [m]": offset, **along}
-    if settings.model.use is not None:
-        return {"from": settings.model.use, **load_model(settings.model.use).facts, **along}
+    if by.use is not None:
+        return {"from": by.use, **load_model(file_of(by.use)).facts, **along}
     if not done.outputs("train"):
         return {"from": "none: it could not be trained", "recipe": settings.model.recipe}
     return {"from": "trained here", **load_model(f"{settings.out}/model.skops").facts, **along}

@@ -17,18 +17,23 @@ from tilestream.model.evaluation import (
     factor_sets,
     figures_by_protocol,
 )
+from tilestream.model.file import load_model
 from tilestream.model.intervals import coverage, with_intervals
 from tilestream.model.physics import Physics
 from tilestream.model.registry import REGRESSORS, UNTRAINED
 from tilestream.model.repeats import repeated
+from tilestream.model.shipped import SHIPPED, file_of
 from tilestream.model.training import MAIN, PREDICTION_COLUMNS
 from tilestream.pipeline.engine.plan import paths_of
 from tilestream.pipeline.engine.stage import Task
+from tilestream.pipeline.jobs.estimator import Estimator
 from tilestream.pipeline.jobs.run_settings import RunSettings
+from tilestream.pipeline.jobs.run_worth import worth_of
 from tilestream.pipeline.stages.evaluate import by_protocol
 from tilestream.pipeline.stages.samples import places_with_factors
 from tilestream.records import Float64
 from tilestream.report.data import AROUND, Findings
+from tilestream.report.worth import Worth
 from tilestream.store import TileStore
 from tilestream.tables import read_tables
 
@@ -111,10 +116,11 @@ def heights_told(done: Done, settings: RunSettings) -> dict[str, list[str]]:
     return notes
 
 
-def offset_told(done: Done, settings: RunSettings) -> list[str]:
-    """A note where the virtual drive as it is makes the estimates, and nobody asked for that."""
-    model, labelled = settings.model, done.labelled
-    if not labelled or model.offset is not None or not model.untrained(labelled):
+def offset_told(done: Done, settings: RunSettings, estimator: Estimator) -> list[str]:
+    """A note where `physics` makes the estimates as it is, and nobody asked for that."""
+    labelled = done.labelled
+    fits = estimator.untrained and not estimator.few
+    if not labelled or settings.model.offset is not None or not fits:
         return []
     told = f"{labelled} places are measured, and a model needs {POINTS_MIN}: the estimates are the"
     return [f"{told} virtual drive as it is (model.offset 0)."]
@@ -223,6 +229,7 @@ def findings_of(
     dataset: Dataset | None,
     facts: Mapping[str, Any],
     settings: RunSettings,
+    estimator: Estimator,
     otherwise: Collection[str],
 ) -> tuple[Findings, dict[str, Any]]:
     """All that the report tells, and the figures of the evaluation for machines.
@@ -241,19 +248,19 @@ def findings_of(
     weights = paths_of(done.outputs("importance"))
     weighed = read_tables(weights) if weights else pd.DataFrame({"factor": []})
     ceiling_of = ceilings(dataset, TARGETS)
-    untrained = model.untrained(done.labelled)
-    trained_here = model.use is None and not untrained
+    labels = labels_of(
+        None if dataset is None else dataset.averaged(done.width),
+        places,
+        points if estimator.trained else None,
+        settings.spacing,
+        otherwise,
+        (model.offset or 0.0) if estimator.untrained else None,
+    )
+    worth = _worth(done, settings, estimator, (places, labels, tables["protocols"]))
     gathered = Findings(
         title=settings.report.title or settings.folder.name,
         places=places,
-        labels=labels_of(
-            None if dataset is None else dataset.averaged(done.width),
-            places,
-            points if trained_here else None,
-            settings.spacing,
-            otherwise,
-            (model.offset or 0.0) if untrained else None,
-        ),
+        labels=labels,
         protocols=tables["protocols"],
         table_iv=tables["table_iv"],
         importances=weighed[weighed["factor"] != ""].reset_index(drop=True),
@@ -262,13 +269,51 @@ def findings_of(
         differences=tables["differences"],
         parts=tables["parts"],
         ceilings=ceiling_of,
-        model="" if model.use else model.recipe,
+        model="" if estimator.use else UNTRAINED if estimator.untrained else model.recipe,
         facts=dict(facts),
         crs=store.settings.crs,
+        worth=worth,
         around=lambda x, y, _: points_around(store, x, y, AROUND),
     )
     evaluation = {name: table.to_dict("records") for name, table in tables.items()}
-    return gathered, evaluation | {"ceilings": ceiling_of}
+    return gathered, evaluation | {"ceilings": ceiling_of, "worth": worth.plain()}
+
+
+def _worth(
+    done: Done,
+    settings: RunSettings,
+    estimator: Estimator,
+    tables: tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame],
+) -> Worth:
+    """What the estimates are worth, from places, labels and the figures by protocol."""
+    places, labels, protocols = tables
+    model, own = None, settings.model.recipe
+    if estimator.use is not None:
+        model = load_model(file_of(estimator.use))
+        shipped = estimator.use == SHIPPED
+        words = "the model that ships with tilestream" if shipped else f"the model {estimator.use}"
+    elif estimator.untrained:
+        words = "the virtual drive as it is, without a model"
+    else:
+        trained = done.outputs("train")
+        model = trained[0].writes.read() if trained else None
+        words = f"a model trained here ({own})"
+    of_blocks = [
+        {str(name): value for name, value in row.items()}
+        for row in protocols.to_dict("records")
+        if (row["protocol"], row["model"]) == ("blocks", own) and estimator.trained
+    ]
+    return worth_of(
+        places,
+        labels,
+        model=words,
+        card={} if model is None else model.card,
+        facts={} if model is None else model.facts,
+        blocks=of_blocks[0] if of_blocks else None,
+        simulated=settings.simulate is not None,
+        shipped=estimator.use == SHIPPED,
+        few=estimator.few,
+    )
 
 
 def points_around(store: TileStore, x: float, y: float, reach: float) -> Float64:

@@ -1,25 +1,25 @@
 """What the main job works on: its settings and files."""
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from glob import glob
 from pathlib import Path
 from typing import Any
 
 from tilestream.errors import ModelError, SourceNotFoundError, UsageError
 from tilestream.files import Files
 from tilestream.formats.logs import ScanSelection, is_log
-from tilestream.formats.routes import RoutesRead, read_all_routes, read_each
+from tilestream.formats.routes import RoutesRead
 from tilestream.model.dataset import made_with
 from tilestream.model.file import load_model
+from tilestream.model.registry import UNTRAINED
+from tilestream.model.shipped import file_of
 from tilestream.model.training import check_making
 from tilestream.notes import Notes, noticed
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.jobs.ingest import Reading, read_sources
+from tilestream.pipeline.jobs.run_routes import routes_in, routes_of_map
 from tilestream.pipeline.jobs.run_settings import RunSettings, one_of_each
 from tilestream.pipeline.jobs.simulate import simulate
-from tilestream.pipeline.jobs.sources import crs_of_map
 from tilestream.pipeline.stages.drive_scans import Reading as DriveReading
 from tilestream.pipeline.stages.observe import Observing
 from tilestream.pipeline.stages.samples import COLUMNS
@@ -37,6 +37,8 @@ from tilestream.settings import (
 from tilestream.simulation.settings import SHINJUKU, SimulationSettings, load_preset
 from tilestream.store import open_store
 
+LEADS_ON = f"; without a model the virtual drive makes the estimates: model {UNTRAINED}"
+"""What there is besides a model that does not fit."""
 JOB = "job"
 """What notes are filed under that are about the job as a whole."""
 
@@ -72,8 +74,9 @@ def inputs_of(settings: RunSettings, client: Any | None, watch: Watch | None) ->
         drives, again = one_of_each(settings.drives)
         files = settings.routes or tuple(dict.fromkeys(drive.log for drive in drives))
         if not files:
-            return _inputs(settings.map.sources, drives, *_all_streets(settings))
-        read = _routes(files, settings, settings.map.sources).at_least(settings.spacing)
+            read, found, note = routes_of_map(settings)
+            return _inputs(settings.map.sources, drives, read, found, {JOB: [note]})
+        read = routes_in(files, settings, settings.map.sources).at_least(settings.spacing)
         told = {JOB: [*again, *_other_lidars(settings)]}
         return _inputs(settings.map.sources, drives, read, files, told)
     folder = simulated_folder(settings)
@@ -90,7 +93,7 @@ def inputs_of(settings: RunSettings, client: Any | None, watch: Watch | None) ->
     surveyed = Path(wanted.survey_of) if wanted.survey_of else folder
     sources = settings.map.sources or (str(surveyed / "survey" / "*.laz"),)
     files = settings.routes or (str(folder / "routes.geojson"),)
-    read = _routes(files, settings, sources)
+    read = routes_in(files, settings, sources)
     if wanted.paths is not None and not settings.routes:
         asked = tuple(route for route in read.routes if route.route_id in wanted.paths)
         read = replace(read, routes=asked)
@@ -165,54 +168,6 @@ def simulated_folder(settings: RunSettings) -> Path:
     if folder is None and not settings.folder.local:
         raise UsageError(f"{settings.out}: a city is simulated to a disk: give simulate.folder")
     return Path(folder or f"{settings.out}/simulation")
-
-
-LANES = "lanelet2_map.osm"
-"""The lanes that Autoware keeps beside the point clouds of a map."""
-
-
-def _all_streets(settings: RunSettings) -> tuple[RoutesRead, list[str], Notes]:
-    """The lanes of the map directories among the sources, their files, and what is to be told.
-
-    Raises:
-        UsageError: there are none, or none as long as the spacing.
-    """
-    sources = settings.map.sources
-    named = [[one] if Path(one).exists() else sorted(glob(one)) for one in sources]  # noqa: PTH207
-    found = [Path(name) for names in named for name in names]
-    files = [str(place / LANES) for place in found if (place / LANES).is_file()]
-    if not files:
-        raise UsageError(
-            f"{settings.out}: no routes: give files of routes, drives, or a map directory with "
-            f"{LANES} in map.sources"
-        )
-    read = _routes(files, settings, sources)
-    lanes = read.routes
-    long = tuple(lane for lane in lanes if lane.arc_length[-1] >= settings.spacing)
-    if not long:
-        raise UsageError(
-            f"{settings.out}: no routes: all {len(lanes)} lanes of {', '.join(files)} are shorter "
-            f"than the spacing, {settings.spacing:g} m"
-        )
-    told = f"no routes were given: all streets of the map, {len(long)} lanes of {', '.join(files)}"
-    short = len(lanes) - len(long)
-    told += f"; {short} shorter than the spacing are left out" if short else ""
-    return replace(read, routes=long), files, {JOB: [told]}
-
-
-def _routes(files: Sequence[str], settings: RunSettings, sources: Sequence[str]) -> RoutesRead:
-    """The routes of some files, each with a name of its own, in the CRS of the map, which is made
-    from these sources. A log that is no drive is read as those of the map.
-    """
-    map_crs = crs_of_map(sources, settings.store_url, settings.map.crs)
-    of_log = {os.path.realpath(drive.log): drive for drive in reversed(settings.drives)}
-    wanted = []
-    for path in files:  # the way of a drive is that of its own poses
-        drive = of_log.get(os.path.realpath(path))
-        options = (settings.map if drive is None else drive).log_options
-        how = {"project_to": settings.project_to, "map_crs": map_crs, "log_options": options}
-        wanted.append((path, how))
-    return read_each(wanted, read_all_routes)
 
 
 def read_map(settings: RunSettings, inputs: Inputs) -> Reading | None:
@@ -346,13 +301,14 @@ def check_model(settings: RunSettings) -> None:
     """
     if settings.model.use is None:
         return
-    if not Files.at(settings.model.use).there():
-        raise SourceNotFoundError(f"{settings.model.use}: no such model file; see model.use")
+    file = file_of(settings.model.use)
+    if not Files.at(file).there():
+        raise SourceNotFoundError(f"{file}: no such model file; see model.use")
     try:
-        check_making(load_model(settings.model.use), making_of(settings))
+        check_making(load_model(file), making_of(settings))
     except ModelError as error:
-        told = str(error).removeprefix(f"{settings.model.use}: ")
-        raise ModelError(f"{settings.model.use}: {told}") from None
+        told = str(error).removeprefix(f"{file}: ")
+        raise ModelError(f"{settings.model.use}: {told}{LEADS_ON}") from None
 
 
 def reading_of(drive: DriveSettings) -> DriveReading:

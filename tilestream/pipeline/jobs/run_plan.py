@@ -20,6 +20,7 @@ from tilestream.pipeline.engine.outputs import Parquet
 from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.engine.stage import Readable, Task
 from tilestream.pipeline.jobs.along_routes import plan_factors, plan_observe, samples_along
+from tilestream.pipeline.jobs.estimator import Estimator, estimator_of
 from tilestream.pipeline.jobs.localize import labelled_places, plan_localize
 from tilestream.pipeline.jobs.run_inputs import (
     Inputs,
@@ -144,13 +145,24 @@ def looking_of(settings: RunSettings) -> Looking:
 
 
 def plan_estimate(
-    settings: RunSettings, grid: TileGrid, measure: Plan, outcomes: Sequence[Outcome]
+    settings: RunSettings,
+    grid: TileGrid,
+    measure: Plan,
+    outcomes: Sequence[Outcome],
+    estimator: Estimator | None = None,
 ) -> Plan:
     """Samples, evaluate, train, predict: from what was measured.
 
     What failed is left out here and listed by the run, so that a tile that cannot be read does not
     keep the rest of the city from its estimates. A tile whose virtual drive failed is left out too:
     nothing is learnt or estimated without it where it was asked for.
+
+    Args:
+        settings: the job.
+        grid: of the map.
+        measure: what measures.
+        outcomes: what became of it.
+        estimator: what makes the estimates; None: by how many places were measured.
     """
     done = {outcome.key for outcome in outcomes if outcome.ok}
     factors, observed, labels = (
@@ -161,7 +173,8 @@ def plan_estimate(
         seen = {task.tile for task in observed}
         factors = [task for task in factors if task.tile in seen]
     tasks: list[Task] = []
-    known, model = _model_there(settings, sum(task.work for task in labels))
+    estimator = estimator or estimator_of(settings, sum(task.work for task in labels))
+    known, model = not estimator.trained, _model_there(estimator)
     if labels and factors:
         of_drives = [task for task in measure.tasks if task.stage in OF_DRIVES and task.key in done]
         joined = _samples(settings, factors, of_drives, labels)
@@ -176,13 +189,9 @@ def plan_estimate(
     return Plan.of(tasks, settings.memory)
 
 
-def _model_there(settings: RunSettings, labelled: int) -> tuple[bool, Readable | None]:
-    """Whether nothing has to be trained, and the model in use; None: the virtual drive as it is."""
-    if settings.model.untrained(labelled):
-        return True, None
-    if settings.model.use is None:
-        return False, None
-    return True, ModelInUse.of(settings.model.use)
+def _model_there(estimator: Estimator) -> Readable | None:
+    """The model in use; None: none is there."""
+    return None if estimator.use is None else ModelInUse.of(estimator.use)
 
 
 def _samples(

@@ -11,10 +11,11 @@ from pydantic import AfterValidator, Field, ValidationError, model_validator
 from tilestream.bounded_yaml import parse_yaml, read_yaml
 from tilestream.config import Settings
 from tilestream.errors import SourceNotFoundError, UsageError, foreign_errors
-from tilestream.files import Files, local_path
+from tilestream.files import Files, local_path, place_of
 from tilestream.matcher import RegistrationSettings, matcher_named
 from tilestream.model.dataset import POINTS_MIN
 from tilestream.model.registry import DEFAULT, OF_VIRTUAL_DRIVES, REGRESSORS, UNTRAINED
+from tilestream.model.shipped import SHIPPED
 from tilestream.settings import (
     NAME,
     DriveSettings,
@@ -47,6 +48,14 @@ Recipe = Annotated[
 """Name of a regressor."""
 
 
+def _model_place(name: str) -> str:
+    return name if name == SHIPPED else place_of(name)
+
+
+ModelPlace = Annotated[str, AfterValidator(_model_place)]
+"""A model file, or `shipped`."""
+
+
 class ModelSettings(Settings):
     """How the errors of the measured places become those of all places."""
 
@@ -54,8 +63,9 @@ class ModelSettings(Settings):
     offset: Annotated[float, Field(ge=0.0)] | None = None
     """With `physics`: what a real scan adds to the error of a virtual one [m]; nothing is trained
     then. Not given: the drives tell it, 0 where fewer than 50 places are measured."""
-    use: Place | None = None
-    """A model file to use instead of training; null: train on the drives."""
+    use: ModelPlace | None = None
+    """A model file to use instead of training, or `shipped`: the one that comes with tilestream;
+    null: train on the drives."""
     seed: int = 0
     """Seed of all that is random in training."""
 
@@ -82,7 +92,8 @@ class RunSettings(PlaceSettings):
     """The logs to measure on; empty with `simulate`: its drives."""
     routes: tuple[LocalFile, ...] = ()
     """Files of routes to estimate along; empty: those of the simulation, or of the drives; without
-    drives, all lanes of a map directory with `lanelet2_map.osm` among the sources."""
+    drives, all lanes of a map directory with `lanelet2_map.osm` among the sources, else the way of
+    the logs that the map is made of."""
     observe: VirtualSettings | None = VirtualSettings()
     """How the vehicle's lidar sees in the virtual drive: usable range, blind sector, starts; null:
     no virtual drive, the paper's factors and their twins only."""
@@ -133,7 +144,10 @@ class RunSettings(PlaceSettings):
             raise ValueError("has no map: give map.sources (files), map.store, or simulate")
         recipe, use = self.model.recipe, self.model.use
         if not (self.simulate or self.drives or use or recipe == UNTRAINED):
-            raise ValueError("has nothing to learn from: give drives, simulate, or model.use")
+            raise ValueError(
+                "has nothing to learn from: give drives, simulate, or model.use; `tilestream "
+                f"estimate` and model: {{recipe: {UNTRAINED}}} need no drives"
+            )
         if recipe in OF_VIRTUAL_DRIVES and self.observe is None and not use:
             others = ", ".join(name for name in REGRESSORS if name not in OF_VIRTUAL_DRIVES)
             raise ValueError(
@@ -141,8 +155,6 @@ class RunSettings(PlaceSettings):
             )
         if recipe == UNTRAINED and use:
             raise ValueError(f"has model.recipe {UNTRAINED} and model.use: give one of them")
-        if not (self.simulate or self.drives or self.routes or self.map.sources):
-            raise ValueError("has no routes: give files of routes, or drives")
         return self
 
     @property

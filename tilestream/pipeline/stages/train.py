@@ -9,6 +9,7 @@ from tilestream.errors import ModelError, SourceNotFoundError
 from tilestream.files import Files
 from tilestream.model.dataset import Dataset
 from tilestream.model.file import load_model, save_model
+from tilestream.model.shipped import file_of
 from tilestream.model.training import Model
 from tilestream.model.training import train as trained
 from tilestream.pipeline.engine.outputs import Facts, Made
@@ -47,17 +48,18 @@ class ModelInUse:
     """A model that was trained elsewhere."""
 
     path: str
+    """Its file, or `shipped`: the one of the installation that reads it."""
     identity: str
     makers: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, path: str) -> "ModelInUse":
-        """The model in a file, known by its bytes."""
-        return cls(path, file_hash(path))
+        """The model in a file, or the one that ships, known by its bytes."""
+        return cls(path, file_hash(file_of(path)))
 
     def read(self) -> Model:
         """The model; a process keeps the last one."""
-        return _model(self.path, self.identity)
+        return _model(file_of(self.path), self.identity)
 
     def counts(self) -> Counts:
         """Nothing that memory depends on."""

@@ -1,0 +1,218 @@
+"""The main job as it goes on: what is known after each part decides what the next one is."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import joblib
+
+from tilestream.files import Files
+from tilestream.pipeline.engine.attempt import Outcome
+from tilestream.pipeline.engine.executor import Watch, execute
+from tilestream.pipeline.engine.plan import Plan, paths_of
+from tilestream.pipeline.engine.stage import Task
+from tilestream.pipeline.jobs.estimator import LABELS, Estimator, estimator_of
+from tilestream.pipeline.jobs.ingest import Reading
+from tilestream.pipeline.jobs.inventory import announce, withdraw
+from tilestream.pipeline.jobs.run_book import Book
+from tilestream.pipeline.jobs.run_inputs import Inputs, read_map
+from tilestream.pipeline.jobs.run_notes import with_logs
+from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
+from tilestream.pipeline.jobs.run_settings import RunSettings
+from tilestream.pipeline.stages.map_plan import MapPlan
+from tilestream.store import TileStore, open_store
+
+LARGE = 50_000
+"""Measured places from which on a forest is grown by all workers together."""
+
+
+class Story:
+    """The job as it goes on.
+
+    Where nothing is to be trained, a place is estimated as soon as its tile and those around it are
+    looked from. Else the labels are joined first: only then is it known whether they suffice.
+    """
+
+    def __init__(self, settings: RunSettings, inputs: Inputs, book: Book) -> None:
+        self.settings = settings
+        self.book = book
+        self.reading: Reading | None = read_map(settings, inputs)
+        self.store: TileStore = (
+            self.reading.store if self.reading else open_store(settings.store_url)
+        )
+        found = self.reading.found if self.reading else None
+        sources = self.store.sources() if found is None else [source.record for source in found]
+        self.inputs = with_logs(settings, inputs, sources)
+        self.measure = Plan((), settings.memory)
+        self.estimator = Estimator()
+        """What makes the estimates, as far as it is known by now."""
+        self.large: Plan | None = None
+        """What is left to be run by all workers together, when all else is done."""
+        self._tiles: set[str] = set()
+        self._open: set[str] = set()
+        self._early = _Early((), set())
+        self._given: set[str] = set()
+        self._joining: str | None = None
+        self._all_planned = False
+
+    def first(self) -> Plan:
+        """What to run first: read the sources, or measure on the map that is there."""
+        tasks = self.reading.first().tasks if self.reading else ()
+        if not tasks:
+            self._close_map()
+            partial = self.settings.map.partial
+            tasks = self._measured(MapPlan.of_store(self.store, partial=partial))
+        return Plan(self._known(tasks), self.settings.memory)
+
+    def grown(self, outcome: Outcome) -> tuple[Task, ...]:
+        """What is to be done now that a task has ended."""
+        merges = self.reading.grown(outcome) if self.reading else None
+        if merges is not None:
+            self._tiles = {task.key for task in merges}
+            if not merges:
+                self._close_map()  # which refuses sources without points
+            return self._known((*merges, *self._measured(MapPlan.of_merges(self.store, merges))))
+        if outcome.key in self._tiles:
+            self._tiles.remove(outcome.key)
+            if not self._tiles:
+                self._close_map()
+        self._open.discard(outcome.key)
+        if not self.measure.tasks or self._all_planned:
+            return ()
+        if self._joining is not None:
+            return self._known(self._joined(outcome) if outcome.key == self._joining else ())
+        if self._open or self._tiles:
+            early = self._early.after(outcome)
+            self._given |= {task.key for task in early}
+            return self._known(early)
+        return self._known(self._estimated())
+
+    def _estimated(self) -> tuple[Task, ...]:
+        """What is to be done when all is measured."""
+        labels = {task.key: task.work for task in self.measure.outputs("label")}
+        good = (outcome.key for outcome in self.book.outcomes if outcome.ok)
+        self.estimator = estimator_of(self.settings, sum(labels.get(key, 0) for key in good))
+        planned = self._plan(self.book.outcomes)
+        joined = planned.outputs("samples")
+        if not (self.estimator.trained and joined):
+            return self._rest(planned)
+        announce(joined)
+        self._joining = joined[0].key
+        self._given = {self._joining}
+        return joined
+
+    def _joined(self, outcome: Outcome) -> tuple[Task, ...]:
+        """What is to be done when it is known how many labels there are to train on."""
+        labelled = int(outcome.facts["rows"]) if outcome.ok else 0
+        self.estimator = estimator_of(self.settings, labelled)
+        return self._rest(self._plan(self.book.outcomes))
+
+    def _rest(self, planned: Plan) -> tuple[Task, ...]:
+        """What of the whole plan has not been given out."""
+        announce(planned.tasks, begun=bool(self._given))
+        self._all_planned = True
+        if self.estimator.few:
+            self.book.failures[LABELS] = self.estimator.few
+        tasks = tuple(task for task in planned.tasks if task.key not in self._given)
+        if _is_large(planned):
+            self.large = Plan(self._known(tasks), planned.memory)
+            return ()
+        return tasks
+
+    def _plan(self, outcomes: Sequence[Outcome]) -> Plan:
+        """What is learnt and estimated from what was measured."""
+        grid = self.store.grid
+        return plan_estimate(self.settings, grid, self.measure, outcomes, self.estimator)
+
+    def _close_map(self) -> None:
+        """Record what the map was made from, as soon as its last tile is written."""
+        if self.reading is not None:
+            self.book.failures |= self.reading.close(self.book.outcomes)
+
+    def _measured(self, map_plan: MapPlan) -> tuple[Task, ...]:
+        """The tasks that measure; tables of other settings are removed before."""
+        self.measure = plan_measure(self.settings, self.inputs, map_plan)
+        self.book.failures |= self.measure.left_out
+        announce(self.measure.tasks)
+        _remove_other_groups(self.settings, self.measure)
+        self._open = {task.key for task in self.measure.tasks}
+        self._early = self._first_estimates()
+        return self.measure.tasks
+
+    def _first_estimates(self) -> "_Early":
+        """The estimates that need not wait for all that is measured."""
+        labelled = sum(task.work for task in self.measure.outputs("label"))
+        self.estimator = estimator_of(self.settings, labelled)
+        if self.estimator.trained:
+            return _Early((), set())
+        planned = self._plan([Outcome(task.key, task.stage) for task in self.measure.tasks])
+        tasks = planned.outputs("predict")
+        announce(tasks)
+        return _Early(tasks, self._open)
+
+    def _known(self, tasks: Sequence[Task]) -> tuple[Task, ...]:
+        self.book.tasks += tasks
+        return tuple(tasks)
+
+
+class _Early:
+    """Tasks that may run once others have ended well; where one of these has failed, the end of
+    all that is measured decides.
+    """
+
+    def __init__(self, tasks: Sequence[Task], open_: set[str]) -> None:
+        self._needs = {task.key: open_ & set(task.needs) for task in tasks}
+        self._tasks = {task.key: task for task in tasks}
+        self._after: dict[str, list[str]] = {}
+        for key, needs in self._needs.items():
+            for need in needs:
+                self._after.setdefault(need, []).append(key)
+
+    def after(self, outcome: Outcome) -> list[Task]:
+        """Those that may run now."""
+        freed = []
+        for key in self._after.pop(outcome.key, ()):
+            if not outcome.ok:
+                self._tasks.pop(key, None)
+            self._needs[key].discard(outcome.key)
+            if not self._needs[key] and key in self._tasks:
+                freed.append(self._tasks.pop(key))
+        return freed
+
+
+def _remove_other_groups(settings: RunSettings, measure: Plan) -> None:
+    """Remove the tables of drives of other settings, so that two jobs are never mixed.
+
+    Those of a drive whose log cannot be read now are kept: they were hours of work, maybe.
+    """
+    kept = {name.removeprefix("drive ") for name in measure.left_out}
+    own = {path.rsplit("/", 1)[0] for path in paths_of(measure.tasks)}
+    for kind, below in (
+        ("errors", ""),
+        ("starts", ""),
+        ("drives", "/factors"),
+        ("drives", "/observability"),
+    ):
+        for group in Files.at(f"{settings.out}/tables/{kind}").names():
+            folder = f"{settings.out}/tables/{kind}/{group}{below}"
+            if folder not in own and group not in kept:
+                withdraw(folder)
+
+
+def _is_large(estimate: Plan) -> bool:
+    """Whether so many places were measured that all workers grow the forest together."""
+    places = sum(task.work for task in estimate.outputs("samples"))
+    return places >= LARGE and bool(estimate.outputs("train"))
+
+
+def estimate_large(plan: Plan, client: Any | None, watch: Watch) -> None:
+    """Estimate with a forest that all workers grow together, through joblib: the same trees."""
+    trains = Plan(plan.outputs("train"), plan.memory)
+    if client is None:
+        outcomes = execute(trains, None, watch)
+    else:
+        with client.as_current(), joblib.parallel_config(backend="dask"):
+            outcomes = execute(trains, None, watch)
+    if all(outcome.ok for outcome in outcomes):
+        begun = {outcome.key for outcome in outcomes}
+        rest = tuple(task for task in plan.tasks if task.key not in begun)
+        execute(Plan(rest, plan.memory), client, watch)
