@@ -31,7 +31,7 @@ from tilestream.report.colours import (
 )
 from tilestream.report.comparison import Comparison
 from tilestream.report.data import Findings, estimates, like_training
-from tilestream.report.formatting import CM_PER_M, cm, cm_by_name, cm_span, percent
+from tilestream.report.formatting import CM_PER_M, cm, cm_about, cm_by_name, cm_span, percent
 from tilestream.report.lines import path_lines, points_per_mark, with_gaps, worst_of_every
 from tilestream.report.segments import worst_places
 from tilestream.report.summary import AXES, STARTS
@@ -96,7 +96,7 @@ def city_map(found: Findings, tip: str) -> dict[str, Any]:
         if not rows.size:
             continue
         rows = rows[np.argsort(estimate[rows], kind="stable")]
-        source = ColumnDataSource(_columns(places, rows, origin), name=kind)
+        source = ColumnDataSource(_columns(places, rows, origin, found.digits), name=kind)
         style: dict[str, Any] = (
             {"color": MISSING, "size": 7, "line_width": 1.5}
             if kind == "missing"
@@ -137,7 +137,9 @@ def _origin(places: pd.DataFrame) -> Float64:
     return np.where(np.abs(corner) >= 10_000.0, corner, 0.0)
 
 
-def _columns(places: pd.DataFrame, rows: Int64, origin: Float64) -> dict[str, Any]:
+def _columns(
+    places: pd.DataFrame, rows: Int64, origin: Float64, digits: int | None
+) -> dict[str, Any]:
     part = places.iloc[rows]
     estimate = estimates(part)
     share = np.clip(scale_of(estimates(places)).step(estimate), 0, None) / 255.0
@@ -149,8 +151,8 @@ def _columns(places: pd.DataFrame, rows: Int64, origin: Float64) -> dict[str, An
         "size": 5.0 + 7.0 * share,
         "route": part["route_id"].astype(str).tolist(),
         "arc": part["arc_length"].to_numpy(np.float64),
-        "shown": [cm(e) for e in estimate],
-        "interval": [cm_span(of["low"], of["high"]) for of in figures],
+        "shown": [cm_about(e, digits) for e in estimate],
+        "interval": [cm_span(of["low"], of["high"], digits) for of in figures],
         "fail": [percent(of["p_fail"]) for of in figures],
         "axes": [cm_by_name(of, AXES) for of in figures],
         "starts": [cm_by_name(of, STARTS) for of in figures],

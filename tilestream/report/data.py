@@ -91,6 +91,11 @@ class Findings:
     around: Around | None = None
     """The map round a place, for the pictures of the worst ones; None: no pictures."""
 
+    @property
+    def digits(self) -> int | None:
+        """With how many significant digits estimates are told; None: their worth is not known."""
+        return None if self.worth is None else self.worth.digits
+
     def __post_init__(self) -> None:
         predicted = tuple(column.name for column in PREDICTION_COLUMNS)
         _require(self.places, (*PLACE_COLUMNS, *predicted), "places")

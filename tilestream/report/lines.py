@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from tilestream.records import Float64, Int64
 from tilestream.report.data import Findings
-from tilestream.report.formatting import CM_PER_M, cm, cm_span
+from tilestream.report.formatting import CM_PER_M, cm, cm_about, cm_span
 
 GAP = 3.0
 """Labels farther apart along a path than this many typical distances are not joined by a line."""
@@ -29,7 +29,7 @@ def path_lines(found: Findings, path: str) -> PathLines:
     """Measured error of each drive along a path, and the estimate of a model without it."""
     labels = found.labels[found.labels["path"].astype(str) == path]
     drives = {str(group): _measured(part) for group, part in labels.groupby("group", sort=True)}
-    return PathLines(drives, _estimated(labels))
+    return PathLines(drives, _estimated(labels, found.digits))
 
 
 def _measured(part: pd.DataFrame) -> dict[str, Any]:
@@ -42,7 +42,7 @@ def _measured(part: pd.DataFrame) -> dict[str, Any]:
     }
 
 
-def _estimated(labels: pd.DataFrame) -> dict[str, Any]:
+def _estimated(labels: pd.DataFrame, digits: int | None) -> dict[str, Any]:
     along = held_out_along(labels)
     arc = along["arc_length"].to_numpy(np.float64)
     breaks = with_gaps(arc)
@@ -62,8 +62,8 @@ def _estimated(labels: pd.DataFrame) -> dict[str, Any]:
     }
     words = {
         "measured": [", ".join(measured[where]) for where in arc],
-        "shown": [cm(e) for e in held],
-        "interval": [cm_span(a, b) for a, b in zip(low, high, strict=True)],
+        "shown": [cm_about(e, digits) for e in held],
+        "interval": [cm_span(a, b, digits) for a, b in zip(low, high, strict=True)],
     }
     broken: dict[str, Any] = {k: np.insert(v, breaks, np.nan) for k, v in lengths.items()}
     return broken | {k: np.insert(v, breaks, "").tolist() for k, v in words.items()}
