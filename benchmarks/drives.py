@@ -272,7 +272,7 @@ def said_by(model: Model, settings: ts.RunSettings, found: Dataset) -> pd.DataFr
 
 
 def intervals(table: pd.DataFrame) -> dict[str, dict[str, dict[str, Figure]]]:
-    """By street (`all`: all), then by lidar: share of the places in the model's interval, and
+    """By street, then by lidar (`all`: all): share of the places in the model's interval, and
     unlike its training, and how large the estimates and the errors are.
     """
     error = table["error_mean"]
@@ -283,8 +283,9 @@ def intervals(table: pd.DataFrame) -> dict[str, dict[str, dict[str, Figure]]]:
     for street in ("all", *dict.fromkeys(table["street"])):
         there = done if street == "all" else done & (table["street"] == street).to_numpy()
         found[street] = {}
-        for lidar in LIDARS:
-            rows = np.flatnonzero(there & (table["lidar"] == lidar).to_numpy())
+        for lidar in ("all", *LIDARS):
+            own = there if lidar == "all" else there & (table["lidar"] == lidar).to_numpy()
+            rows = np.flatnonzero(own)
             found[street][lidar] = {
                 "held": figure(table, rows, lambda some: float(held[some].mean())),
                 "out_of_domain": figure(table, rows, lambda some: float(strange[some].mean())),

@@ -214,24 +214,29 @@ def retrain(wanted: Retraining) -> str:
 
 
 def on_real_drives(found: dict[str, Any]) -> dict[str, Any]:
-    """The figures of real drives that a card keeps: places, streets, pooled rank correlation with
-    its interval, and by lidar the level (estimated / measured), by how much estimates are off [m]
-    and the share of the errors that the intervals hold, with its standard error.
+    """What a card keeps of real drives: counts, the pooled rank correlation with its interval, by
+    how much estimates are off, the share of the errors that the intervals hold with its standard
+    error, and both and the level (estimated / measured, medians) by lidar.
     """
     streets = [name for name in found["pooled"] if name != "all"]
-    pooled = found["pooled"]["all"]
+    pooled, of_model = found["pooled"]["all"], found["model"]["all"]
+    lidars = {name: one for name, one in of_model.items() if name != "all"}
+    held = {
+        name: [one["held"][k] for k in ("value", "standard_error")]
+        for name, one in of_model.items()
+    }
     return {
         "places": found["places"],
+        "drives": len(streets),
         "streets": streets,
-        "spearman": [pooled["value"], pooled["low"], pooled["high"]],
+        "spearman": [pooled[name] for name in ("value", "low", "high")],
+        "mae_m": of_model["all"]["off"]["value"],
+        "coverage": held.pop("all"),
+        "coverage_by_lidar": held,
+        "mae_m_by_lidar": {name: one["off"]["value"] for name, one in lidars.items()},
         "level": {
-            lidar: one["estimated"]["value"] / one["measured"]["value"]
-            for lidar, one in found["model"]["all"].items()
-        },
-        "mae": {lidar: one["off"]["value"] for lidar, one in found["model"]["all"].items()},
-        "coverage": {
-            lidar: [one["held"]["value"], one["held"]["standard_error"]]
-            for lidar, one in found["model"]["all"].items()
+            name: one["estimated"]["value"] / one["measured"]["value"]
+            for name, one in lidars.items()
         },
     }
 

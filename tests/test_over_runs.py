@@ -223,7 +223,7 @@ def test_held_out_figures_are_those_of_cross_validation(together: Dataset) -> No
     for name, protocol in (("held-out paths", "path"), ("held-out lidar", "lidar")):
         told, of = found[name], figures_of(points[protocol])
         assert told["places"] == len(points[protocol])
-        assert (told["mae"], told["skill"][0]) == (of.mae, of.skill)
+        assert (told["mae_m"], told["skill"][0]) == (of.mae, of.skill)
         assert told["skill"][1] <= of.skill <= told["skill"][2]
         assert told["over_physics"] == [0.0, 0.0, 0.0]  # it is physics
         assert 0.5 < told["coverage"][0] <= 1.0

@@ -17,6 +17,8 @@ CHECKED = "checked"
 """Where a card says what the model is worth."""
 HELD_OUT = {"path": "held-out paths", "lidar": "held-out lidar", "district": "held-out district"}
 """What the protocols are called on a card."""
+SHARES = ("p_fail",)
+"""Targets that are no lengths."""
 TARGETS = ("error_mean", "p_fail", "error_tail")
 """What is judged besides the mean, on held-out paths."""
 
@@ -30,8 +32,8 @@ def checked_of(dataset: Dataset, recipe: str, seed: int = 0) -> dict[str, Any]:
         seed: of the fits.
 
     Returns:
-        Plain JSON: for `held-out paths`, `held-out lidar` and `held-out district` the places, `mae`
-        [m], `skill`, `segment_skill` and `spearman` (each with the ends of its 90 % interval),
+        Plain JSON: for `held-out paths`, `held-out lidar` and `held-out district` the places,
+        `mae_m` [m], `skill`, `segment_skill` and `spearman` (each with the ends of its 90 % interval),
         `coverage` (with its standard error), `over_physics` (by how much the skill is larger than
         that of the virtual drive plus one number, with its ends) and, for paths, `p_fail` and
         `tail` likewise; of lidars and districts `of_paths`, their skill as a share of that of the
@@ -50,6 +52,7 @@ def checked_of(dataset: Dataset, recipe: str, seed: int = 0) -> dict[str, Any]:
             points = held_out(dataset, splits, recipe, target, seed)
             physics = held_out(dataset, splits, Physics.name, target, seed)
             told = _figures(points, physics)
+            told["mae" if target in SHARES else "mae_m"] = told.pop("off")
             if target != TARGETS[0]:
                 found[HELD_OUT[name]][target] = told
                 continue
@@ -67,7 +70,7 @@ def _figures(points: pd.DataFrame, physics: pd.DataFrame) -> dict[str, Any]:
     return {
         "places": len(points),
         "blocks": int(points["block"].nunique()),
-        "mae": figures["mae"],
+        "off": figures["mae"],
         **{name: _ended(figures, name) for name in ("skill", "segment_skill", "spearman")},
         "coverage": [float(whole["covered"]), float(whole["error"])],
         "over_physics": _ended(against, "skill"),
