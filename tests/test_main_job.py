@@ -862,7 +862,7 @@ def test_the_command_prints_the_headline_and_gates(
     assert "of road, 78 sample points" in said
     assert re.search(r" cm +median estimated error", said)
     assert command(["run", str(config), "--workers", "1", "--fail-over", "1e-6"]) == 1
-    assert "78 of 78 sample points are estimated above 1e-06 m" in capsys.readouterr().err
+    assert "mean: 78 of 78 sample points are above 1e-06 m" in capsys.readouterr().err
     assert command(["run", str(config), "--workers", "1", "--fail-over", "99"]) == 0
     assert "0 of 78 sample points have no estimate" in capsys.readouterr().err
 

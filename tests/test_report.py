@@ -346,7 +346,8 @@ def test_a_gate_closes_above_the_limit(found: Findings) -> None:
     assert gate(places, highest) == []
     (closed,) = gate(places, highest - 1e-6)
     worst = places.loc[places["estimate"].idxmax()]
-    assert f"1 of {len(places)} sample points are estimated above" in closed
+    assert f"mean: 1 of {len(places)} sample points are above" in closed
+    assert closed.endswith("estimated")
     assert f"on {worst['route_id']} at {worst['arc_length']:.0f} m" in closed
     for limit in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(UsageError, match="threshold"):

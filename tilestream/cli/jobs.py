@@ -2,6 +2,7 @@
 
 import io
 import json
+from dataclasses import dataclass
 from importlib import resources
 from typing import Annotated, Any, Literal
 
@@ -21,12 +22,13 @@ from tilestream.pipeline.jobs import simulate as simulation
 from tilestream.pipeline.jobs.estimate import OUT, estimate_settings
 from tilestream.pipeline.jobs.forecast import forecast
 from tilestream.pipeline.jobs.run_book import RECORD, told_before
-from tilestream.pipeline.jobs.run_inputs import extent
+from tilestream.pipeline.jobs.run_inputs import extent, simulations
 from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
 from tilestream.pipeline.stages.simulated import SCENE_BYTES
 from tilestream.report import cards, gate
 from tilestream.report.drives import EVALUATED, DriveMeasured
-from tilestream.report.segments import MISSING, check_threshold
+from tilestream.report.measured import MEASURES, check_measure
+from tilestream.report.segments import MISSING, Over, check_threshold
 from tilestream.settings import (
     LabelSettings,
     LogSettings,
@@ -36,7 +38,7 @@ from tilestream.settings import (
     SimulateSettings,
     VirtualSettings,
 )
-from tilestream.simulation.settings import SimulationSettings, load_preset
+from tilestream.simulation.settings import SimulationSettings
 
 SHIPPED = resources.files("tilestream") / "data"
 
@@ -49,11 +51,41 @@ def template() -> None:
 FailOver = Annotated[
     float | None,
     typer.Option(
-        help="Exit with 1 if any estimate is above this [m], if less than "
+        help="Exit with 1 if any error, estimated or measured, is above this [m], if less than "
         f"{EVALUATED:.0%} of a drive or of the places of a route were evaluated, or if more "
         f"than {MISSING:.0%} of all places have no estimate."
     ),
 ]
+
+
+Asked = Annotated[
+    str, typer.Option("--measure", help=f"Of --fail-over: {', '.join(MEASURES)} (p_fail: a share).")
+]
+PerWhat = Annotated[
+    Over, typer.Option("--over", help="Of --fail-over: single places, or means over 12 m.")
+]
+
+
+@dataclass(frozen=True)
+class Gate:
+    """What `--fail-over` asks for."""
+
+    limit: float | None
+    """Greatest error that passes; None: no gate."""
+    measure: str
+    """Part of the error."""
+    over: Over
+    """Places or segments."""
+
+    def check(self) -> None:
+        """Refuse what cannot be asked for, before the job.
+
+        Raises:
+            UsageError: no such measure, or a limit that is not positive.
+        """
+        check_measure(self.measure)
+        if self.limit is not None:
+            check_threshold(self.limit)
 
 
 @on_cluster
@@ -94,6 +126,8 @@ def estimate(
     ] = None,
     folder: Annotated[str, typer.Option("--out", help="The run directory.")] = OUT,
     fail_over: FailOver = None,
+    measure: Asked = "mean",
+    over: PerWhat = "places",
     dry_run: Annotated[bool, typer.Option("--dry-run", help="As `plan`.")] = False,
     as_json: AsJson = False,
     cluster: Cluster = ALL_CORES,
@@ -111,15 +145,15 @@ def estimate(
     It ends by printing what the estimates are worth, the headline, and where the report is. The
     same command continues a job that was stopped. `tilestream run` learns from drives too.
     """
-    if fail_over is not None:
-        check_threshold(fail_over)
+    gate_of = Gate(fail_over, measure, over)
+    gate_of.check()
     settings = estimate_settings(
         sources, route, folder, model, places, seeing, labels, which_map, report
     )
     if dry_run:
         show_plan(settings, as_json)
     else:
-        do_and_tell(settings, cluster, fail_over, as_json)
+        do_and_tell(settings, cluster, gate_of, as_json)
 
 
 @on_cluster
@@ -127,23 +161,23 @@ def run(
     config: Config,
     changes: Changes = [],  # noqa: B006
     fail_over: FailOver = None,
+    measure: Asked = "mean",
+    over: PerWhat = "places",
     dry_run: Annotated[bool, typer.Option("--dry-run", help="As `plan`.")] = False,
     as_json: AsJson = False,
     cluster: Cluster = ALL_CORES,
 ) -> None:
     """The main job: from map and drives to the estimated error everywhere, and its report."""
-    if fail_over is not None:
-        check_threshold(fail_over)
+    gate_of = Gate(fail_over, measure, over)
+    gate_of.check()
     settings = read_settings(config, changes)
     if dry_run:
         show_plan(settings, as_json)
     else:
-        do_and_tell(settings, cluster, fail_over, as_json)
+        do_and_tell(settings, cluster, gate_of, as_json)
 
 
-def do_and_tell(
-    settings: RunSettings, cluster: Cluster, fail_over: float | None, as_json: bool
-) -> None:
+def do_and_tell(settings: RunSettings, cluster: Cluster, gate_of: Gate, as_json: bool) -> None:
     """Run the main job, print its headline, and close the gate where one is asked for.
 
     What failed is told after the headline of what is done.
@@ -165,8 +199,8 @@ def do_and_tell(
         show_report(folder)
     if failed is not None:
         raise failed
-    if fail_over is not None:
-        require_within(folder, fail_over)
+    if gate_of.limit is not None:
+        require_within(folder, gate_of.limit, gate_of.measure, gate_of.over)
 
 
 def do_job(settings: RunSettings, cluster: Cluster) -> Files:
@@ -225,18 +259,17 @@ def lost_labels(report: dict[str, Any]) -> list[str]:
     return [f"{total:,} of {of:,} measured places are not used:", *reasons]
 
 
-def require_within(folder: Files, limit: float) -> None:
-    """Fail where the estimated error exceeds a limit, or is not known: a gate for a map release.
+def require_within(folder: Files, limit: float, measure: str, over: Over) -> None:
+    """Fail where the error exceeds a limit, or is not known: a gate for a map release.
 
     Raises:
         LimitError: the gate is closed; says why (`gate`).
     """
-    needed = ["route_id", "arc_length", "estimate"]
     table = io.BytesIO(folder.under("report/places.parquet").read())
-    places = pd.read_parquet(table, columns=needed)
+    places = pd.read_parquet(table)
     missing = int(places["estimate"].isna().sum())
     say(f"{missing:,} of {len(places):,} sample points have no estimate", to=err)
-    closed = gate(places, limit, report_of(folder)["drives"])
+    closed = gate(places, limit, report_of(folder)["drives"], measure, over)
     if closed:
         raise LimitError("; ".join(closed))
 
@@ -264,17 +297,21 @@ def show_plan(settings: RunSettings, as_json: bool) -> None:
 @on_cluster
 @with_settings
 def simulate(
-    city: Annotated[Literal["shinjuku"], typer.Argument(help="The city that ships with us.")],
+    city: Annotated[
+        Literal["shinjuku", "sendagaya"], typer.Argument(help="A district that ships with us.")
+    ],
     folder: Annotated[str, typer.Option("--out", help="Folder of map, logs and routes.")],
-    what: Annotated[SimulateSettings, fields("preset", "scans_per_point", "seed", "size")],
+    what: Annotated[
+        SimulateSettings, fields("preset", "scans_per_point", "every", "survey_of", "seed", "size")
+    ],
     day: Annotated[SimulationSettings, fields("drive")],
     paths: Annotated[str | None, typer.Option(help="Only these, e.g. I,III; default: all.")] = None,
     dry_run: DryRun = False,
     cluster: Cluster = HERE,
 ) -> None:
-    """Simulate a survey of Shinjuku and drives through it; a killed run continues."""
-    changes = {"seed": what.seed, "drive": day.drive}
-    settings = load_preset(what.preset).model_copy(update=changes)
+    """Simulate a survey of a district and drives through it; a killed run continues."""
+    where = what.model_copy(update={"city": city, "drives": day.drive + 1})
+    settings = simulations(where)[day.drive]
     wanted = extent(what) | {"paths": paths.split(",") if paths else None}
     if dry_run:
         out.print(plan_table(simulation.plan_simulation(settings, folder, **wanted)))

@@ -33,12 +33,12 @@ def checked_of(dataset: Dataset, recipe: str, seed: int = 0) -> dict[str, Any]:
 
     Returns:
         Plain JSON: for `held-out paths`, `held-out lidar` and `held-out district` the places,
-        `mae_m` [m], `skill`, `segment_skill` and `spearman` (each with the ends of its 90 % interval),
-        `coverage` (with its standard error), `over_physics` (by how much the skill is larger than
-        that of the virtual drive plus one number, with its ends) and, for paths, `p_fail` and
-        `tail` likewise; of lidars and districts `of_paths`, their skill as a share of that of the
-        same places on held-out paths, and of each lidar its own. What cannot be held out is left
-        out.
+        `mae_m` [m], `skill`, `segment_skill` and `spearman` (each with the ends of its 90 %
+        interval), `coverage` (with its standard error), `over_physics` (by how much the skill is
+        larger than that of the virtual drive plus one number, with its ends) and, for paths,
+        `p_fail` (whose `mae` is a share) and `error_tail` likewise; of lidars and districts
+        `of_paths`, their skill as a share of that of the same places on held-out paths. What cannot
+        be held out is left out.
     """
     protocols = {one.name: one for one in protocols_of(dataset) if one.name in HELD_OUT}
     found: dict[str, Any] = {}

@@ -18,7 +18,7 @@ from tilestream.model.explain import PIECE, Typical, compared, in_words, typical
 from tilestream.model.features import with_derived
 from tilestream.model.intervals import LEVEL, NOT_CALIBRATED, Interval, calibrate, wider_for_few
 from tilestream.model.making import Outside, outside, shared
-from tilestream.model.physics import width_of
+from tilestream.model.physics import Physics, width_of
 from tilestream.model.registry import DEFAULT, OF_VIRTUAL_DRIVES, REGRESSORS
 from tilestream.model.regressor import Regressor, held_out_estimates
 from tilestream.model.splits import block_splits, leave_lidar_out
@@ -152,7 +152,7 @@ def train(
     interval = _interval(dataset, fit)
     card = card_of(dataset)
     if card[JUDGED]:
-        card[WIDER] = _wider_outside(dataset, fit, interval)
+        card[WIDER] = _wider_outside(dataset, interval)
     # An axis or a tail that is the same everywhere teaches nothing and is learnt as that constant.
     there = [target for target in TARGETS if target in dataset.rows]
     regressors = {t: regressor.fit(dataset, t, seed, settings, n_jobs) for t in there}
@@ -204,12 +204,11 @@ def _interval(dataset: Dataset, fit: Callable[[Dataset], Regressor]) -> Interval
     return calibrate(dataset.label(MAIN), estimate, dataset.pieces, LEVEL)
 
 
-def _wider_outside(
-    dataset: Dataset, fit: Callable[[Dataset], Regressor], interval: Interval
-) -> float:
+def _wider_outside(dataset: Dataset, interval: Interval) -> float:
     """How many times longer an interval is for a lidar or a matcher outside of the card: as much as
-    it has to be for lidars that are held out, the hardest of them counting twice; at least 1 and at
-    most `WIDEST`, which it is where none can be held out.
+    that of physics, on which every model of several lidars stands, has to be for lidars that are
+    held out, the hardest of them counting twice; at least 1 and at most `WIDEST`, which it is where
+    none can be held out.
     """
     try:
         splits = leave_lidar_out(dataset)
@@ -217,7 +216,7 @@ def _wider_outside(
         return WIDEST
     if not interval.blocks:
         return WIDEST
-    estimate = held_out_estimates(dataset, splits, fit)
+    estimate = held_out_estimates(dataset, splits, partial(Physics.fit, target=MAIN))
     lidars = dataset.rows["lidar"].to_numpy(str)
     unseen = calibrate(dataset.label(MAIN), estimate, lidars, LEVEL)
     (low, high), (least, most) = (one.around(estimate) for one in (interval, unseen))

@@ -33,6 +33,7 @@ from tilestream.report.comparison import Comparison
 from tilestream.report.data import Findings, estimates, like_training
 from tilestream.report.formatting import CM_PER_M, cm, cm_about, cm_by_name, cm_span, percent
 from tilestream.report.lines import path_lines, points_per_mark, with_gaps, worst_of_every
+from tilestream.report.measured import measure_of
 from tilestream.report.segments import worst_places
 from tilestream.report.summary import AXES, STARTS
 
@@ -105,6 +106,7 @@ def city_map(found: Findings, tip: str) -> dict[str, Any]:
         glyphs = plot.scatter("x", "y", source=source, marker=marker, legend_label=name, **style)
         # of the dots under the mouse the worst, which is the one on top
         plot.add_tools(_hover(glyphs, tip, sort_by=[("estimate", -1)]))
+    _draw_measured(plot, found, origin, (tip, mapper))
     _number_the_worst(plot, places, origin)
     if np.isfinite(estimate).any():
         bar = ColorBar(color_mapper=mapper, title="estimated error [cm]", width=12, padding=4)
@@ -151,7 +153,10 @@ def _columns(
         "size": 5.0 + 7.0 * share,
         "route": part["route_id"].astype(str).tolist(),
         "arc": part["arc_length"].to_numpy(np.float64),
-        "shown": [cm_about(e, digits) for e in estimate],
+        "shown": [
+            f"{cm_about(e, digits)}{f', measured {cm(m)}' if np.isfinite(m) else ''}"
+            for e, m in zip(estimate, measure_of(part).measured, strict=True)
+        ],
         "interval": [cm_span(of["low"], of["high"], digits) for of in figures],
         "fail": [percent(of["p_fail"]) for of in figures],
         "axes": [cm_by_name(of, AXES) for of in figures],
@@ -159,6 +164,25 @@ def _columns(
         "domain": like_training(part).tolist(),
         "reason": part["reason"].fillna("").astype(str).tolist(),
     }
+
+
+def _draw_measured(plot: figure, found: Findings, origin: Float64, how: tuple[str, Any]) -> None:
+    """Squares in the colour of the error that was measured there, on top of the estimates."""
+    tip, mapper = how
+    measured = measure_of(found.places).measured
+    rows = np.flatnonzero(np.isfinite(measured))
+    if not rows.size:
+        return
+    every = points_per_mark(len(rows), MOST)
+    route = found.places["route_id"].to_numpy()[rows]
+    rows = rows[worst_of_every(every, route, measured[rows])]
+    columns = _columns(found.places, rows, origin, found.digits)
+    columns["measured"] = measured[rows] * CM_PER_M
+    source = ColumnDataSource(columns, name="measured")
+    style: dict[str, Any] = {"fill_color": {"field": "measured", "transform": mapper}}
+    style |= {"marker": "square", "size": 9, "line_color": "black", "legend_label": "measured"}
+    glyphs = plot.scatter("x", "y", source=source, **style)
+    plot.add_tools(_hover(glyphs, tip, sort_by=[("measured", -1)]))
 
 
 def _number_the_worst(plot: figure, places: pd.DataFrame, origin: Float64) -> None:

@@ -22,6 +22,7 @@ from tilestream.model.training import PREDICTION_COLUMNS
 from tilestream.records import Float64
 from tilestream.report.colours import scale_of
 from tilestream.report.data import Findings, estimates
+from tilestream.report.measured import MEASURED_COLUMNS
 from tilestream.report.segments import segments
 from tilestream.report.summary import plain, segment
 
@@ -36,6 +37,7 @@ _CATALOGUE = {
     for column in (
         *PLACE_COLUMNS,
         *catalogue.COLUMNS,
+        *MEASURED_COLUMNS,
         WEAK_ALONG,
         SPREAD_ALONG,
         SPREAD_ACROSS,

@@ -81,14 +81,23 @@ def with_measured(places: pd.DataFrame, labels: pd.DataFrame, reach: float) -> p
     return places.assign(**{measured_column(m): found[label] for m, label in MEASURES.items()})
 
 
+def check_measure(name: str) -> None:
+    """Refuse a measure that there is not.
+
+    Raises:
+        UsageError: it is not of `MEASURES`.
+    """
+    if name not in MEASURES:
+        raise UsageError(f"no measure {name!r}: choose from {', '.join(MEASURES)}")
+
+
 def measure_of(places: pd.DataFrame, name: str = "mean") -> Measure:
     """A part of the error of all places, estimated and, where `with_measured` knows it, measured.
 
     Raises:
         UsageError: no such measure.
     """
-    if name not in MEASURES:
-        raise UsageError(f"no measure {name!r}: choose from {', '.join(MEASURES)}")
+    check_measure(name)
     column = measured_column(name)
     nothing = np.full(len(places), np.nan)
     return Measure(

@@ -2,16 +2,17 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
 from tilestream.errors import UsageError
+from tilestream.model.figures import SEGMENT
 from tilestream.records import Float64, Int64
-from tilestream.report.data import estimates
 from tilestream.report.drives import EVALUATED
+from tilestream.report.measured import measure_of
 
 WORST = 10
 """How many of the worst places are shown."""
@@ -23,34 +24,54 @@ BRIDGE = 5.0
 """Places over the threshold this near along a route are one segment, whatever lies between [m]."""
 MISSING = 0.05
 """Share of the places that may be without an estimate where a gate opens."""
+Over = Literal["places", "segments"]
+"""What a gate asks of."""
 NAMED = 5
 """Routes that are named where a gate stays closed."""
 
 
-def gate(places: pd.DataFrame, limit: float, drives: Sequence[Mapping[str, Any]] = ()) -> list[str]:
+def gate(
+    places: pd.DataFrame,
+    limit: float,
+    drives: Sequence[Mapping[str, Any]] = (),
+    measure: str = "mean",
+    over: Over = "places",
+) -> list[str]:
     """Why a map does not pass a limit; empty: it passes.
 
-    What is not known does not pass: a route without any estimate fails the gate, and so does one
-    of whose places less than `EVALUATED` have one, a drive that was not evaluated to that share,
-    and a map of which more than `MISSING` of the places have no estimate.
+    A measured error counts as an estimate does. What is not known does not pass: a route without
+    any estimate fails the gate, and so does one of whose places less than `EVALUATED` have one, a
+    drive that was not evaluated to that share, and a map of which more than `MISSING` of the places
+    have no estimate.
 
     Args:
-        places: route_id, arc_length [m] and estimate [m] of every sample point.
-        limit: greatest estimate that passes [m].
+        places: route_id, arc_length [m] and the estimates of every sample point, with what was
+            measured there (`with_measured`).
+        limit: greatest error that passes [m]; of p_fail a share.
         drives: how much of each drive was measured (`DriveMeasured.plain`).
+        measure: the part of the error that is asked for (`MEASURES`).
+        over: `segments`: means over `SEGMENT` of a route instead of single places.
 
     Raises:
-        UsageError: the limit is not positive.
+        UsageError: the limit is not positive, or no such measure.
     """
     check_threshold(limit)
-    estimate = estimates(places)
+    one = measure_of(places, measure)
+    estimate, known_error = one.estimate, one.known
     found, total = [], len(places)
-    over = int((estimate > limit).sum())
-    if over:
-        worst = places.iloc[int(np.nanargmax(estimate))]
+    judged = places[["route_id", "arc_length"]].assign(
+        error=known_error, measured=known_error == one.measured
+    )
+    judged = _windows(judged) if over == "segments" else judged
+    above = judged[judged["error"] > limit]
+    if len(above):
+        worst = above.iloc[int(np.argmax(above["error"]))]
+        unit = "" if measure == "p_fail" else " m"
+        what = "sample points" if over == "places" else f"segments of {SEGMENT:g} m"
         found.append(
-            f"{over} of {total} sample points are estimated above {limit:g} m, the worst "
-            f"{worst['estimate']:.2f} m on {worst['route_id']} at {worst['arc_length']:.0f} m"
+            f"{measure}: {len(above)} of {len(judged)} {what} are above {limit:g}{unit}, the worst "
+            f"{worst['error']:.2f}{unit} on {worst['route_id']} at {worst['arc_length']:.0f} m, "
+            f"{'measured' if worst['measured'] else 'estimated'}"
         )
     known = pd.Series(np.isfinite(estimate)).groupby(places["route_id"].to_numpy(str)).mean()
     blind = known.index[known == 0.0].tolist()
@@ -74,6 +95,17 @@ def gate(places: pd.DataFrame, limit: float, drives: Sequence[Mapping[str, Any]]
             "report/index.html lists why"
         )
     return found
+
+
+def _windows(judged: pd.DataFrame) -> pd.DataFrame:
+    """Means of `error` over each `SEGMENT` of a route, of the places that have one; `measured`
+    where any of them is.
+    """
+    there = judged[judged["error"].notna()]
+    number = (there["arc_length"] // SEGMENT).rename("number")
+    parts = there.groupby(["route_id", number])
+    how = {"error": "mean", "arc_length": "min", "measured": "any"}
+    return parts.agg(how).reset_index()
 
 
 def _named(names: Sequence[str]) -> str:
@@ -118,9 +150,9 @@ def segments(places: pd.DataFrame, threshold: float) -> list[Int64]:
 
     Args:
         places: `Findings.places`, in order.
-        threshold: of the estimate [m].
+        threshold: of the estimate, or of what was measured there [m].
     """
-    over = np.flatnonzero(estimates(places) > threshold)
+    over = np.flatnonzero(measure_of(places).known > threshold)
     route, arc = places["route_id"].to_numpy()[over], places["arc_length"].to_numpy()[over]
     near = (np.diff(arc) <= BRIDGE) | ((np.diff(over) == 1) & joined(places)[over[:-1]])
     parts = np.split(over, np.flatnonzero(~near | (route[1:] != route[:-1])) + 1)
@@ -128,12 +160,13 @@ def segments(places: pd.DataFrame, threshold: float) -> list[Int64]:
 
 
 def worst_places(places: pd.DataFrame, count: int = WORST, apart: float = APART) -> list[int]:
-    """Rows of the highest estimates, the highest first, no two nearer than `apart` [m].
+    """Rows of the highest errors, estimated or measured there, the highest first, no two nearer
+    than `apart` [m].
 
     Distance is straight through the map, so two routes over one spot name it once.
     """
     at = places[["x", "y", "z"]].to_numpy(np.float64)
-    return _apart(estimates(places), np.where(np.isfinite(at), at, 0.0), count, apart)
+    return _apart(measure_of(places).known, np.where(np.isfinite(at), at, 0.0), count, apart)
 
 
 def worst_measured(labels: pd.DataFrame, count: int = MEASURED, apart: float = APART) -> list[int]:

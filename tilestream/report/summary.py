@@ -13,6 +13,7 @@ from tilestream.model.training import PREDICTION_COLUMNS
 from tilestream.records import Float64, Int64
 from tilestream.report.data import PLACE_COLUMNS, Findings, estimates, like_training
 from tilestream.report.formatting import cm, cm_about, distance, known, percent, thousands
+from tilestream.report.measured import measure_of
 from tilestream.report.paper_tables import paper_table_i, paper_table_iii, table_i, table_iii
 from tilestream.report.segments import reaches, segments, worst_measured, worst_places
 from tilestream.version import VERSION
@@ -73,10 +74,13 @@ def headline(places: pd.DataFrame, threshold: float) -> dict[str, Any]:
     there = np.isfinite(estimate)
     here = estimate[there]
     reach = reaches(places)
-    over = there & (np.where(there, estimate, 0.0) > threshold)
+    error = measure_of(places)
+    driven = np.isfinite(error.measured)
+    over = np.where(driven | there, error.known, 0.0) > threshold
     like = like_training(places)
     outside, compared = int((like == "no").sum()), int((like != "not known").sum())
     missing = places.loc[~there, "reason"]
+    known_count = int((driven | there).sum())
     return {
         "places": len(places),
         "routes": int(places["route_id"].nunique()),
@@ -84,13 +88,16 @@ def headline(places: pd.DataFrame, threshold: float) -> dict[str, Any]:
         "estimated": int(there.sum()),
         **quantiles(here),
         "over": int(over.sum()),
-        "over_share": float(over.sum() / here.size) if here.size else None,
+        "over_share": float(over.sum() / known_count) if known_count else None,
         "over_length": float(reach[over].sum()),
         "outside": outside if compared else None,
         "outside_share": outside / compared if compared else None,
         "missing": len(missing),
         "missing_share": len(missing) / len(places),
         "missing_by_reason": by_reason(missing),
+        "measured": int(driven.sum()),
+        "measured_max": float(error.measured[driven].max()) if driven.any() else None,
+        "measured_over": int((error.measured[driven] > threshold).sum()),
         "shares_over": {
             f"{limit:.2f}": float((here > limit).mean()) if here.size else None
             for limit in THRESHOLDS
@@ -125,6 +132,8 @@ def cards(content: Mapping[str, Any]) -> list[tuple[str, str]]:
     drives = content["drives"]
     measured, scans = (sum(drive[name] for drive in drives) for name in ("measured", "scans"))
     of_drives = (f"{thousands(measured)} of {thousands(scans)}", "scans of the drives measured")
+    there = f"the largest measured error, of {thousands(head['measured'])} places"
+    highest = (cm(head["measured_max"]), there)
     evaluated = f"{thousands(head['estimated'])} of {thousands(head['places'])}"
     missing = f"places without an estimate ({percent(head['missing_share'])})"
     return [
@@ -132,6 +141,7 @@ def cards(content: Mapping[str, Any]) -> list[tuple[str, str]]:
         (cm_about(head["median"], digits), "median estimated error"),
         (cm_about(head["p95"], digits), "95 % of the places are estimated below this"),
         (cm_about(head["max"], digits), "the highest estimate"),
+        *([highest] if head["measured"] else []),
         (percent(head["over_share"]), over),
         *([unlike] if known(head["outside_share"]) else []),
         (evaluated, "places evaluated"),
@@ -158,19 +168,22 @@ def routes(places: pd.DataFrame, threshold: float) -> list[dict[str, Any]]:
 
 
 def segment(places: pd.DataFrame, rows: Int64) -> dict[str, Any]:
-    """A stretch of road over the threshold: where, how long, how bad. `worst`, the parts of the
-    error and the reason are those of its worst place, `mean` is over all of it that has an
-    estimate.
+    """A stretch of road over the threshold: where, how long, how bad. `worst` is estimated or
+    measured, the parts of the error and the reason are estimates of that place, `mean` is over all
+    of it that has an estimate.
     """
     part = places.iloc[rows]
-    worst = part.iloc[int(np.nanargmax(estimates(part)))]
+    error = measure_of(part)
+    row = int(np.nanargmax(error.known))
+    worst = part.iloc[row]
     return {
         "route_id": str(worst["route_id"]),
         "begin": float(part["arc_length"].iloc[0]),
         "end": float(part["arc_length"].iloc[-1]),
         "length": float(reaches(places)[rows].sum()),
         "places": len(part),
-        "worst": float(worst["estimate"]),
+        "worst": float(error.known[row]),
+        "worst_measured": bool(error.known[row] == error.measured[row]),
         "worst_at": float(worst["arc_length"]),
         "mean": float(part["estimate"].mean()),
         **{name: float(worst[name]) for name in (*AXES, *STARTS)},
@@ -189,7 +202,8 @@ def _all_like(part: pd.DataFrame) -> bool | None:
 def place(places: pd.DataFrame, row: int) -> dict[str, Any]:
     """One sample point with its estimate."""
     names = (*PLACE_COLUMNS, *(column.name for column in PREDICTION_COLUMNS))
-    return {name: places[name].iloc[row] for name in names}
+    found = {name: places[name].iloc[row] for name in names}
+    return found | {"measured": float(measure_of(places.iloc[[row]]).measured[0])}
 
 
 def measured_worst(labels: pd.DataFrame) -> list[dict[str, Any]]:

@@ -33,6 +33,7 @@ from tilestream.pipeline.stages.evaluate import by_protocol
 from tilestream.pipeline.stages.samples import places_with_factors
 from tilestream.records import Float64
 from tilestream.report.data import AROUND, Findings
+from tilestream.report.measured import with_measured
 from tilestream.report.worth import Worth
 from tilestream.store import TileStore
 from tilestream.tables import read_tables
@@ -257,6 +258,8 @@ def findings_of(
         (model.offset or 0.0) if estimator.untrained else None,
     )
     worth = _worth(done, settings, estimator, (places, labels, tables["protocols"]))
+    own = labels if labels.empty else labels[~labels["group"].isin(list(otherwise))]
+    places = with_measured(places, own, settings.spacing)
     gathered = Findings(
         title=settings.report.title or settings.folder.name,
         places=places,
