@@ -24,9 +24,9 @@ from report_json import charts, source
 from streets import SCANS, STREETS, job
 
 import tilestream as ts
+from tilestream.apps.verbs import stage_rows
 from tilestream.cli import run as command
 from tilestream.cli.jobs import lost_labels, require_within
-from tilestream.cli.tables import forecast_rows
 from tilestream.errors import (
     LimitError,
     ModelError,
@@ -930,7 +930,7 @@ def test_a_plan_before_anything_is_there_reads_headers_only(inputs: Path, tmp_pa
 def test_a_city_that_is_not_simulated_yet_is_planned_first(tmp_path: Path) -> None:
     small = {"paths": ("III",), "size": "small", "drives": 2, "preset": "paper"}
     settings = RunSettings(out=str(tmp_path / "run"), simulate=small)
-    stages = {row["stage"]: row for row in forecast_rows(forecast(settings))}
+    stages = {row["stage"]: row for row in stage_rows(forecast(settings).tasks)}
     one_survey = load_preset("paper").survey.passes * 40
     assert {name: row["work"] for name, row in stages.items()} == {
         "survey": one_survey,

@@ -21,69 +21,126 @@ with them.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from tilestream.factors.observability import observability as observability
-from tilestream.factors.sample_points import sample_points as sample_points
-from tilestream.factors.table import factors as factors
-from tilestream.formats.logs import ScanSelection as ScanSelection
-from tilestream.formats.routes import read_all_routes as read_all_routes
-from tilestream.formats.routes import read_route as read_route
-from tilestream.formats.routes import read_routes as read_routes
-from tilestream.grid import TileKey as TileKey
-from tilestream.label import disc_starts as disc_starts
-from tilestream.label import localization_error as localization_error
-from tilestream.label import refined_pose as refined_pose
-from tilestream.label import start_poses as start_poses
-from tilestream.matcher import RegistrationSettings as RegistrationSettings
-from tilestream.ndt import cells_of as cells_of
-from tilestream.pipeline.jobs.along_routes import factors_along as factors_along
-from tilestream.pipeline.jobs.along_routes import observe_along as observe_along
-from tilestream.pipeline.jobs.ingest import ingest as ingest
-from tilestream.pipeline.jobs.localize import localize as localize
-from tilestream.pipeline.jobs.starts_of import starts_of as starts_of
-from tilestream.records import Cells as Cells
-from tilestream.records import LocalizationError as LocalizationError
-from tilestream.records import Registrations as Registrations
-from tilestream.records import Route as Route
-from tilestream.registration import register as register
-from tilestream.sensor import HDL64 as HDL64
-from tilestream.sensor import OS1_128 as OS1_128
-from tilestream.sensor import VLP16 as VLP16
-from tilestream.sensor import Sensor as Sensor
-from tilestream.settings import LogOptions as LogOptions
-from tilestream.settings import StartSettings as StartSettings
-from tilestream.settings import VirtualSettings as VirtualSettings
-from tilestream.store import Tile as Tile
-from tilestream.store import TileStore as TileStore
-from tilestream.store import open_store as open_store
+from tilestream.factors.observability import observability
+from tilestream.factors.sample_points import sample_points
+from tilestream.factors.table import factors
+from tilestream.formats.logs import ScanSelection
+from tilestream.formats.routes import read_all_routes, read_route, read_routes
+from tilestream.grid import TileKey
+from tilestream.label import (
+    disc_starts,
+    localization_error,
+    refined_pose,
+    start_poses,
+)
+from tilestream.matcher import RegistrationSettings
+from tilestream.ndt import cells_of
+from tilestream.pipeline.jobs.along_routes import factors_along, observe_along
+from tilestream.pipeline.jobs.ingest import ingest
+from tilestream.pipeline.jobs.localize import localize
+from tilestream.pipeline.jobs.starts_of import starts_of
+from tilestream.records import Cells, LocalizationError, Registrations, Route
+from tilestream.registration import register
+from tilestream.sensor import HDL64, OS1_128, VLP16, Sensor
+from tilestream.settings import LogOptions, StartSettings, VirtualSettings
+from tilestream.store import Tile, TileStore, open_store
 from tilestream.version import VERSION
 
 if TYPE_CHECKING:
-    from tilestream.apps.view import view as view
-    from tilestream.definitions import explain as explain
-    from tilestream.pipeline.jobs.estimate import estimate as estimate
-    from tilestream.pipeline.jobs.run import dataset as dataset
-    from tilestream.pipeline.jobs.run import run as run
-    from tilestream.pipeline.jobs.run_settings import RunSettings as RunSettings
-    from tilestream.pipeline.jobs.train_over import train_over as train_over
+    from tilestream.apps.compare import Choice, choices_of, compare
+    from tilestream.apps.diff import diff
+    from tilestream.apps.info import info
+    from tilestream.apps.verbs import demo, plan, simulate, status, template
+    from tilestream.apps.verify import repair, verify
+    from tilestream.apps.view import view
+    from tilestream.definitions import explain
+    from tilestream.pipeline.jobs.estimate import estimate
+    from tilestream.pipeline.jobs.run import dataset, run
+    from tilestream.pipeline.jobs.run_settings import RunSettings
+    from tilestream.pipeline.jobs.train_over import train_over
+
+__all__ = [
+    "HDL64",
+    "OS1_128",
+    "VLP16",
+    "Cells",
+    "Choice",
+    "LocalizationError",
+    "LogOptions",
+    "RegistrationSettings",
+    "Registrations",
+    "Route",
+    "RunSettings",
+    "ScanSelection",
+    "Sensor",
+    "StartSettings",
+    "Tile",
+    "TileKey",
+    "TileStore",
+    "VirtualSettings",
+    "cells_of",
+    "choices_of",
+    "compare",
+    "dataset",
+    "demo",
+    "diff",
+    "disc_starts",
+    "estimate",
+    "explain",
+    "factors",
+    "factors_along",
+    "info",
+    "ingest",
+    "localization_error",
+    "localize",
+    "observability",
+    "observe_along",
+    "open_store",
+    "plan",
+    "read_all_routes",
+    "read_route",
+    "read_routes",
+    "refined_pose",
+    "register",
+    "repair",
+    "run",
+    "sample_points",
+    "simulate",
+    "start_poses",
+    "starts_of",
+    "status",
+    "template",
+    "train_over",
+    "verify",
+    "view",
+]
+
+_LATE = {
+    "apps.compare": ("Choice", "choices_of", "compare"),
+    "apps.diff": ("diff",),
+    "apps.info": ("info",),
+    "apps.verbs": ("demo", "plan", "simulate", "status", "template"),
+    "apps.verify": ("repair", "verify"),
+    "apps.view": ("view",),
+    "definitions": ("explain",),
+    "pipeline.jobs.estimate": ("estimate",),
+    "pipeline.jobs.run": ("dataset", "run"),
+    "pipeline.jobs.run_settings": ("RunSettings",),
+    "pipeline.jobs.train_over": ("train_over",),
+}
+"""What is imported when it is asked for: what it needs (scikit-learn, Bokeh, matplotlib) would cost
+every worker process 100 MB that its tiles have a use for."""
 
 
 def __getattr__(name: str) -> Any:
-    """The main job and the view, when they are asked for: what they need (scikit-learn, Bokeh,
-    matplotlib) would cost every worker process 100 MB that its tiles have a use for.
-    """
-    if name in ("run", "dataset"):
-        return getattr(import_module("tilestream.pipeline.jobs.run"), name)
-    if name == "estimate":
-        return import_module("tilestream.pipeline.jobs.estimate").estimate
-    if name == "train_over":
-        return import_module("tilestream.pipeline.jobs.train_over").train_over
-    if name == "view":
-        return import_module("tilestream.apps.view").view
-    if name == "explain":
-        return import_module("tilestream.definitions").explain
-    if name == "RunSettings":
-        return import_module("tilestream.pipeline.jobs.run_settings").RunSettings
+    for module, names in _LATE.items():
+        if name in names:
+            return getattr(import_module(f"tilestream.{module}"), name)
     raise AttributeError(f"module 'tilestream' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return list(__all__)
 
 
 __version__ = VERSION

@@ -3,18 +3,18 @@
 import io
 import json
 from dataclasses import dataclass
-from importlib import resources
 from typing import Annotated, Any, Literal
 
 import pandas as pd
 import typer
 
+from tilestream.apps import verbs
 from tilestream.cli.cluster import ALL_CORES, HERE, AllCores, Cluster, on_cluster
 from tilestream.cli.fields import fields, with_settings
 from tilestream.cli.options import AsJson, Changes, Config, DryRun
 from tilestream.cli.printing import err, out, print_json, say, say_notes
 from tilestream.cli.progress import progress
-from tilestream.cli.tables import forecast_rows, forecast_table, plan_table, report_table
+from tilestream.cli.tables import forecast_table, plan_table, report_table
 from tilestream.errors import LimitError, PartialError
 from tilestream.files import Files
 from tilestream.pipeline.jobs import run as main_job
@@ -40,12 +40,10 @@ from tilestream.settings import (
 )
 from tilestream.simulation.settings import SimulationSettings
 
-SHIPPED = resources.files("tilestream") / "data"
-
 
 def template() -> None:
     """Print a job for your city: a YAML file that explains every setting."""
-    out.out((SHIPPED / "city.yaml").read_text(), end="", highlight=False)
+    out.out(verbs.template(), end="", highlight=False)
 
 
 FailOver = Annotated[
@@ -286,7 +284,7 @@ def plan(
 def show_plan(settings: RunSettings, as_json: bool) -> None:
     """Print what a job would run."""
     expected = forecast(settings)
-    rows = forecast_rows(expected)
+    rows = verbs.stage_rows(expected.tasks)
     if as_json:
         print_json({"stages": rows, "notes": expected.notes})
         return
@@ -327,6 +325,4 @@ def demo(
     workers: AllCores = None,
 ) -> None:
     """The main job on a few streets of Shinjuku, simulated first: needs minutes and no files."""
-    with resources.as_file(SHIPPED / "demo.yaml") as path:
-        settings = read_settings(path, [f"out={json.dumps(folder)}"])
-    show_report(do_job(settings, Cluster(workers=workers)))
+    show_report(do_job(verbs.demo_settings(folder), Cluster(workers=workers)))

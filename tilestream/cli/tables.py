@@ -13,9 +13,7 @@ from tilestream.apps.info import Info
 from tilestream.crs import named
 from tilestream.factors.catalogue import COLUMNS
 from tilestream.label import FAILED
-from tilestream.pipeline.engine.costs import core_hours
 from tilestream.pipeline.engine.plan import Plan, megabytes
-from tilestream.pipeline.jobs.forecast import Forecast
 from tilestream.report.drives import DriveMeasured
 from tilestream.report.formatting import cm_about
 from tilestream.report.paper_tables import LIMITS
@@ -48,27 +46,6 @@ def plan_table(plan: Plan) -> Table:
     for stage, count, promise in plan.describe():
         table.add_row(stage, str(count), megabytes(promise))
     return table
-
-
-def forecast_rows(expected: Forecast) -> list[dict[str, object]]:
-    """Stages of a job: tasks, the largest promise of any task, needs, estimated core-hours."""
-    hours = core_hours(expected.tasks)
-    stages = {task.key: task.stage for task in expected.tasks}
-    rows: list[dict[str, object]] = []
-    for stage in dict.fromkeys(task.stage for task in expected.tasks):
-        tasks = [task for task in expected.tasks if task.stage == stage]
-        after = {stages[need] for task in tasks for need in task.needs if need in stages}
-        rows.append(
-            {
-                "stage": stage,
-                "tasks": len(tasks),
-                "work": sum(task.work for task in tasks),
-                "after": sorted(after - {stage}),
-                "promised_bytes": max(task.promised_bytes for task in tasks),
-                "core_hours": round(hours[stage], 4),
-            }
-        )
-    return rows
 
 
 def forecast_table(rows: list[dict[str, object]]) -> Table:
