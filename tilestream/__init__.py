@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from tilestream.apps.compare import Choice, choices_of, compare
     from tilestream.apps.diff import diff
     from tilestream.apps.info import info
+    from tilestream.apps.runs import Run, open_run, read_run
     from tilestream.apps.verbs import demo, plan, simulate, status, template
     from tilestream.apps.verify import repair, verify
     from tilestream.apps.view import view
@@ -70,6 +71,7 @@ __all__ = [
     "RegistrationSettings",
     "Registrations",
     "Route",
+    "Run",
     "RunSettings",
     "ScanSelection",
     "Sensor",
@@ -95,11 +97,13 @@ __all__ = [
     "localize",
     "observability",
     "observe_along",
+    "open_run",
     "open_store",
     "plan",
     "read_all_routes",
     "read_route",
     "read_routes",
+    "read_run",
     "refined_pose",
     "register",
     "repair",
@@ -119,6 +123,7 @@ _LATE = {
     "apps.compare": ("Choice", "choices_of", "compare"),
     "apps.diff": ("diff",),
     "apps.info": ("info",),
+    "apps.runs": ("Run", "open_run", "read_run"),
     "apps.verbs": ("demo", "plan", "simulate", "status", "template"),
     "apps.verify": ("repair", "verify"),
     "apps.view": ("view",),

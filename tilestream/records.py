@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from tilestream.errors import UsageError
 from tilestream.grid import MM_PER_M, whole_mm
 from tilestream.kernels import cells as kernels
+from tilestream.notebook import draw_cells, draw_line, html_of
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -48,7 +49,7 @@ class Trajectory:
     """Name of the frame that moves, as recorded."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Route:
     """A path along which a vehicle drives, k >= 2 points of it."""
 
@@ -65,6 +66,27 @@ class Route:
     """Coordinate reference system, where the file or the user names it."""
     dropped: int = 0
     """Points of the file that were left out: less than 0.5 m from the one before that was not."""
+
+    def __repr__(self) -> str:
+        points, length = len(self.positions), self.arc_length[-1]
+        return f"Route {self.route_id} ({points:,} points, {length:,.1f} m, CRS {self.crs})"
+
+    def _repr_html_(self) -> str:
+        facts = {
+            "points": f"{len(self.positions):,}",
+            "length [m]": f"{self.arc_length[-1]:,.1f}",
+            "heights": "none" if np.isnan(self.positions[:, 2]).all() else "of the route",
+            "CRS": self.crs or "not named",
+        }
+        return html_of(f"Route {self.route_id}", facts)
+
+    def plot(self, ax: Any | None = None) -> Any:
+        """The path from above, with a dot where it begins; the axes.
+
+        Args:
+            ax: matplotlib's axes to draw on; None: those of a new figure.
+        """
+        return draw_line(self.positions, self.route_id, ax)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -139,6 +161,23 @@ class Cells:
             text += ", " + ", ".join(f"{a} {lo:.1f} to {hi:.1f}" for a, lo, hi in spans) + " m"
             text += f", {self.count.sum()} points"
         return text + ")"
+
+    def _repr_html_(self) -> str:
+        facts = {"cells": f"{len(self):,}", "edge [m]": f"{self.cell_size:g}"}
+        if len(self):
+            low, high = self.mean.min(axis=0), self.mean.max(axis=0)
+            spans = zip("xyz", low, high, strict=True)
+            facts |= {f"{axis} [m]": f"{lo:.1f} to {hi:.1f}" for axis, lo, hi in spans}
+            facts["points"] = f"{self.count.sum():,}"
+        return html_of("Cells", facts)
+
+    def plot(self, ax: Any | None = None) -> Any:
+        """The cells from above, ellipses of two standard deviations coloured by height; the axes.
+
+        Args:
+            ax: matplotlib's axes to draw on; None: those of a new figure.
+        """
+        return draw_cells(self.mean, self.covariance, ax)
 
     @property
     def cell_mm(self) -> int:

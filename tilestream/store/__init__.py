@@ -13,7 +13,6 @@ identity, facts). Without a mark a table is missing, whatever lies there, and a 
 manifest does not name is none; every reader looks at both. All that is read has a checksum.
 """
 
-import html
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -33,6 +32,7 @@ from tilestream.files import Files, place_of
 from tilestream.grid import MM_PER_M, Box, TileGrid, TileKey, whole_mm
 from tilestream.lock import LOCK, writer_of
 from tilestream.marks import Mark
+from tilestream.notebook import draw_points, draw_squares, html_of, html_table
 from tilestream.records import Cells, Float64, Int64
 from tilestream.store.arrays import NODE as NODE
 from tilestream.store.arrays import (
@@ -67,6 +67,27 @@ class Tile:
         mark = self.mark(POINTS)
         size = f"{mark.facts['points']:,} points" if mark.status == "done" else mark.reason
         return f"Tile {self.key} ({mark.status}: {size}) of {self.store.url}"
+
+    def _repr_html_(self) -> str:
+        mark, box = self.mark(POINTS), self.store.grid.core(self.key)
+        spans = ((box.x_lo, box.x_hi), (box.y_lo, box.y_hi))
+        facts = {
+            f"{axis} [m]": f"{low / MM_PER_M:g} to {high / MM_PER_M:g}"
+            for axis, (low, high) in zip("xy", spans, strict=True)
+        }
+        told = {"status": mark.status, "points": f"{mark.facts.get('points', 0):,}", **facts}
+        return html_of(f"Tile {self.key} of {self.store.url}", told)
+
+    def plot(self, ax: Any | None = None) -> Any:
+        """Its points from above, coloured by height; the axes.
+
+        Args:
+            ax: matplotlib's axes to draw on; None: those of a new figure.
+
+        Raises:
+            TileNotReadyError: the tile is not done.
+        """
+        return draw_points(self.points(), ax)
 
     def points(self, halo: bool = False) -> Float64:
         """The map points of the tile's core, (n, 3) float64 [m, map frame].
@@ -401,11 +422,18 @@ class TileStore:
             (str(key), mark.status, f"{mark.facts.get('points', 0):,}", mark.reason)
             for key, mark in self.marks().items()
         ]
-        head = "<tr><th>tile</th><th>status</th><th>points</th><th>reason</th></tr>"
-        cells = ["".join(f"<td>{html.escape(cell)}</td>" for cell in row) for row in rows[:20]]
-        more = f"<p>… and {len(rows) - 20} more tiles</p>" if len(rows) > 20 else ""
-        body = "".join(f"<tr>{row}</tr>" for row in cells)
-        return f"<p>{html.escape(repr(self))}</p><table>{head}{body}</table>{more}"
+        return html_table(repr(self), ("tile", "status", "points", "reason"), rows)
+
+    def plot(self, ax: Any | None = None) -> Any:
+        """Its tiles from above, coloured by their points, grey where a tile is not done; the axes.
+
+        Args:
+            ax: matplotlib's axes to draw on; None: those of a new figure.
+        """
+        marks, edge = self.marks(), self.settings.tile_size
+        done = [m.facts["points"] if m.status == "done" else np.nan for m in marks.values()]
+        corners = np.array(list(marks), np.float64).reshape(-1, 2) * edge
+        return draw_squares(corners, edge, np.array(done, np.float64), "map points of a tile", ax)
 
 
 def open_store(url: str | os.PathLike[str]) -> TileStore:

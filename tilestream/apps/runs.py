@@ -1,0 +1,250 @@
+"""A run directory in Python: its places as one table, and a picture of them.
+
+```
+report/places.parquet, or factors, observability, predictions --+
+errors (labels): the nearest to each place ---------------------+--> a row per place
+```
+"""
+
+import io
+import json
+import os
+from dataclasses import dataclass
+from functools import cached_property
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.spatial import cKDTree
+
+from tilestream.errors import SourceNotFoundError, StoreNotFoundError, UsageError
+from tilestream.factors.rows import PLACE_COLUMNS
+from tilestream.files import Files, place_of
+from tilestream.model.join import ON_PATH
+from tilestream.model.training import ESTIMATES, MAIN, PREDICTION_COLUMNS
+from tilestream.notebook import axes_of, html_of
+from tilestream.pipeline.jobs.run_book import RECORD, told_before
+from tilestream.pipeline.jobs.run_folder import map_of, rows_of, table_paths
+from tilestream.report.colours import MISSING, palette, scale_of
+from tilestream.store import TileStore
+from tilestream.tables import read_tables
+
+PLACE = [column.name for column in PLACE_COLUMNS]
+ESTIMATED = [column.name for column in PREDICTION_COLUMNS]
+MEASURED = {
+    target: "measured" if target == MAIN else f"measured_{name}"
+    for target, name in ESTIMATES.items()
+}
+"""Name of each label beside the estimate of the same."""
+OF_LABEL = ["drive", *MEASURED.values(), "measured_distance"]
+ENDED = ("done", "failed")
+"""What a run says of itself whose report is of its tables."""
+
+
+def read_run(place: str | os.PathLike[str]) -> pd.DataFrame:
+    """The places of a run with their estimates, measured errors and factors, a row each.
+
+    The columns are: the place (`route_id`, `sample`, `arc_length`, `heading`, `x`, `y`, `z`,
+    `above_ground`); what was measured there (`measured` [m] is the mean error of the paper;
+    `measured_p_fail`, `measured_floor`, `measured_tail`, `measured_along`, `measured_across`,
+    `measured_up`; on which `drive`, and `measured_distance` [m] from the place); the estimates
+    (`estimate`, `low`, `high`, `p_fail`, `floor`, …, `in_domain`, `status`, `reason`); the factors.
+    `ts.explain(NAME)` says what each means. What a job did not make has no column or is NaN.
+
+    A measured scan counts at the nearest place within 5 m, and of several the nearest; a place has
+    one label, of one drive. One that is near no place has a row of its own, with the drive as
+    `route_id`. All labels with the factors of exactly their places are in `ts.dataset`.
+
+    Args:
+        place: a run directory of `run`, `localize` or `factors`, a path or an fsspec URL.
+
+    Returns:
+        The table. A GeoDataFrame in the map's CRS where geopandas is installed (without a CRS where
+        the map has none, or has moved), else a DataFrame.
+
+    Raises:
+        SourceNotFoundError: no tables there.
+        IncompleteError: a table that must be there is not: the job has not ended.
+        DamagedError: a table is not what was written.
+    """
+    table = with_labels(_places(place), _labels(place))
+    if table.empty and not len(table.columns):
+        raise SourceNotFoundError(f"{place}: no tables of a run; `ts.run` writes some")
+    first = [name for name in (*PLACE, *OF_LABEL, *ESTIMATED) if name in table]
+    table = table[[*first, *(name for name in table if name not in first)]]
+    if find_spec("geopandas") is None:
+        return table
+    geopandas = import_module("geopandas")
+    points = geopandas.points_from_xy(table["x"], table["y"], table["z"])
+    found: pd.DataFrame = geopandas.GeoDataFrame(table, geometry=points, crs=_crs(place))
+    return found
+
+
+def _crs(place: str | os.PathLike[str]) -> str | None:
+    try:
+        return map_of(place).settings.crs
+    except StoreNotFoundError:
+        return None
+
+
+def _places(place: str | os.PathLike[str]) -> pd.DataFrame:
+    """Every sample point of the routes; of a run that has ended as its report has it, else as far
+    as its tables go, each virtual drive of its own place alone.
+    """
+    folder = Files.at(place)
+    report = folder.under("report/places.parquet")
+    if report.there() and told_before(folder.under(RECORD)).get("state") in ENDED:
+        return pd.read_parquet(io.BytesIO(report.read())).drop(columns="geometry", errors="ignore")
+    tables = [rows_of(place, name) for name in ("factors", "observability", "predictions")]
+    found = pd.DataFrame()
+    for table in tables:
+        if table is None:
+            continue
+        if found.empty:
+            found = table
+            continue
+        own = [name for name in table if name not in found or name in ("status", "reason")]
+        found = found.drop(columns=["status", "reason"])
+        own_rows = table[["route_id", "sample", *own]]
+        found = found.merge(own_rows, on=["route_id", "sample"], how="left")
+    if "status" in found:
+        lost = found["status"].isna()
+        found.loc[lost, ["status", "reason"]] = "failed", "its task failed, or has not run"
+    return found
+
+
+def _labels(place: str | os.PathLike[str]) -> pd.DataFrame:
+    """The measured places, with the drive of each."""
+    tables = []
+    for path in table_paths(place, "errors"):
+        group = path.rsplit("/", 2)[1]
+        rows = read_tables([path])
+        tables.append(rows.assign(drive="" if group == "errors" else group))
+    rows = pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
+    return rows[rows["status"] == "done"].reset_index(drop=True) if len(rows) else rows
+
+
+def with_labels(places: pd.DataFrame, labels: pd.DataFrame) -> pd.DataFrame:
+    """Places with what was measured at each: the nearest label within `ON_PATH`.
+
+    Args:
+        places: with `x`, `y`, `z` [m]; may be empty.
+        labels: likewise, with `drive` and the labels (`MEASURED`), all finite; may be empty.
+
+    Returns:
+        The places in their order with the columns `OF_LABEL`, then the labels that are near none.
+    """
+    if not len(labels):
+        return places
+    at = labels[["x", "y", "z"]].to_numpy(np.float64)
+    told = labels.rename(columns=MEASURED)
+    told = told[[name for name in OF_LABEL if name in told]]
+    known = np.zeros(0, np.int64)
+    distance, nearest = np.full(len(at), np.inf), np.zeros(len(at), np.int64)
+    if len(places):
+        where = places[["x", "y", "z"]].to_numpy(np.float64)
+        known = np.flatnonzero(np.isfinite(where).all(axis=1))
+    if known.size:
+        near, row = cKDTree(where[known] - at[0]).query(at - at[0])
+        distance, nearest = np.asarray(near), known[np.asarray(row)]
+    told = told.assign(measured_distance=np.where(distance <= ON_PATH, distance, np.nan))
+    here = told[distance <= ON_PATH].set_index(nearest[distance <= ON_PATH])
+    here = here.sort_values("measured_distance", kind="stable")
+    here = here[~here.index.duplicated()]
+    apart = labels[distance > ON_PATH]
+    rest = told[distance > ON_PATH].assign(
+        route_id=apart["drive"],
+        **{name: apart[name] for name in PLACE if name in apart and name != "route_id"},
+        **{name: apart[name] for name in ("status", "reason") if not len(places)},
+    )
+    beside = places.join(here.reindex(range(len(places)))) if len(places) else places
+    parts = [part for part in (beside, rest) if len(part)]
+    return pd.concat(parts, ignore_index=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A run directory: its table, its map, a picture."""
+
+    place: str
+    """The directory, or its URL."""
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """Its places (`read_run`)."""
+        return read_run(self.place)
+
+    @cached_property
+    def store(self) -> TileStore:
+        """Its map; errors as `ts.open_store`."""
+        return map_of(self.place)
+
+    @cached_property
+    def report(self) -> dict[str, Any]:
+        """The figures of its report; empty where it has none."""
+        file = Files.at(self.place).under("report/report.json")
+        found: dict[str, Any] = json.loads(file.read()) if file.there() else {}
+        return found
+
+    def plot(self, column: str | None = None, ax: Any | None = None) -> Any:
+        """Its streets from above, coloured by error: large where measured, small where estimated,
+        grey crosses where neither is known; the axes.
+
+        Args:
+            column: a column of the table to colour by instead, e.g. a factor.
+            ax: matplotlib's axes to draw on; None: those of a new figure.
+
+        Raises:
+            UsageError: the table has no such column, or it is no number.
+        """
+        table = self.table
+        if column is not None and (column not in table or table[column].dtype.kind not in "iufb"):
+            raise UsageError(f"{self.place}: {column!r} is no column of numbers: see `.table`")
+        blank = pd.Series(np.nan, table.index)
+        small = table.get("estimate" if column is None else column, blank).astype(np.float64)
+        large = table.get("measured", blank) if column is None else blank
+        scale = scale_of(large.fillna(small).to_numpy(np.float64))
+        ax, colours = axes_of(ax), np.array([*palette(), MISSING])
+        for values, size in ((small, 8.0), (large.astype(np.float64), 30.0)):
+            rows = np.flatnonzero(values.notna())
+            rows = rows[np.argsort(values.to_numpy()[rows], kind="stable")]  # the worst on top
+            shade = colours[scale.step(values.to_numpy(np.float64)[rows])]
+            ax.scatter(table["x"].iloc[rows], table["y"].iloc[rows], s=size, c=shade.tolist(), lw=0)
+        neither = table[small.isna() & large.isna()]
+        ax.scatter(neither["x"], neither["y"], s=12.0, c=MISSING, marker="x", lw=1.0)
+        shades = import_module("matplotlib.colors").ListedColormap(palette())
+        ramp = import_module("matplotlib.cm").ScalarMappable(cmap=shades)
+        ramp.set_clim(scale.low, scale.high)
+        ax.figure.colorbar(ramp, ax=ax, label=column or "localization error [m]")
+        return ax
+
+    def _repr_html_(self) -> str:
+        table = self.table
+        facts: dict[str, object] = {
+            "places": f"{len(table):,}",
+            "routes": ", ".join(dict.fromkeys(table["route_id"].astype(str))),
+        }
+        for name, told in (("estimate", "estimated"), ("measured", "measured")):
+            if name in table:
+                known = table[name].dropna()
+                spans = f", {known.min():.3f} to {known.max():.3f} m" if len(known) else ""
+                facts[told] = f"{len(known):,} places{spans}"
+        if self.report:
+            facts["report"] = f"{self.place}/report/index.html"
+        return html_of(f"Run {self.place}", facts)
+
+
+def open_run(place: str | os.PathLike[str]) -> Run:
+    """A run directory of `run`, `localize` or `factors`: `.table`, `.plot()`, `.store`, `.report`.
+
+    Args:
+        place: a path or an fsspec URL.
+
+    Raises:
+        SourceNotFoundError: nothing there. What is read later raises as `read_run`.
+    """
+    if not Files.at(place).there():
+        raise SourceNotFoundError(f"{place}: no such run directory")
+    return Run(place_of(place))
