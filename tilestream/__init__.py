@@ -39,7 +39,7 @@ from tilestream.pipeline.jobs.along_routes import factors_along, observe_along
 from tilestream.pipeline.jobs.ingest import ingest
 from tilestream.pipeline.jobs.localize import localize
 from tilestream.pipeline.jobs.starts_of import starts_of
-from tilestream.records import Cells, LocalizationError, Registrations, Route
+from tilestream.records import Cells, Column, LocalizationError, Registrations, Route
 from tilestream.registration import register
 from tilestream.sensor import HDL64, OS1_128, VLP16, Sensor
 from tilestream.settings import LogOptions, StartSettings, VirtualSettings
@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from tilestream.apps.verbs import demo, plan, simulate, status, template
     from tilestream.apps.verify import repair, verify
     from tilestream.apps.view import view
+    from tilestream.cli.progress import progress
     from tilestream.definitions import explain
     from tilestream.pipeline.jobs.estimate import estimate
     from tilestream.pipeline.jobs.run import dataset, run
@@ -66,6 +67,7 @@ __all__ = [
     "VLP16",
     "Cells",
     "Choice",
+    "Column",
     "LocalizationError",
     "LogOptions",
     "RegistrationSettings",
@@ -100,6 +102,7 @@ __all__ = [
     "open_run",
     "open_store",
     "plan",
+    "progress",
     "read_all_routes",
     "read_route",
     "read_routes",
@@ -127,6 +130,7 @@ _LATE = {
     "apps.verbs": ("demo", "plan", "simulate", "status", "template"),
     "apps.verify": ("repair", "verify"),
     "apps.view": ("view",),
+    "cli.progress": ("progress",),
     "definitions": ("explain",),
     "pipeline.jobs.estimate": ("estimate",),
     "pipeline.jobs.run": ("dataset", "run"),

@@ -256,9 +256,9 @@ class Column:
     """What it says, in a sentence or two."""
     source: str
     """The formula, and where it comes from: `eq. 4`, `definitions, section 4`, …"""
-    factor_set: Literal["faithful", "robust", "observability"] = "faithful"
+    factor_set: Literal["faithful", "robust", "observability", "own"] = "faithful"
     """The paper's own, or a twin that is not degenerate (definitions, section 3 and
-    definitions, section 4)."""
+    definitions, section 4); `own`: of a file of the user's (`factors/own.py`)."""
     dtype: str = "float64"
     """Type of its values."""
 

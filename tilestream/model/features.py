@@ -63,5 +63,9 @@ def with_derived(factors: pd.DataFrame) -> pd.DataFrame:
 
 
 def observed(columns: Sequence[Column]) -> list[Column]:
-    """The factors that look from a place: observability and the virtual drive."""
-    return [column for column in columns if column.factor_set == "observability"]
+    """The factors that look from a place: observability and the virtual drive, and with them those
+    of the user's own; none where there is no observability.
+    """
+    if not any(column.factor_set == "observability" for column in columns):
+        return []
+    return [column for column in columns if column.factor_set in ("observability", "own")]

@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from tilestream.errors import ModelError, UsageError
+from tilestream.factors.own import OWN
 from tilestream.model.card import JUDGED, card_of
 from tilestream.model.dataset import TARGETS, Dataset, matrix
 from tilestream.model.domain import WIDEST, Domain, domain_of
 from tilestream.model.explain import PIECE, Typical, compared, in_words, typical_of
 from tilestream.model.features import with_derived
 from tilestream.model.intervals import LEVEL, NOT_CALIBRATED, Interval, calibrate, wider_for_few
-from tilestream.model.making import Outside, outside, shared
+from tilestream.model.making import Outside, check_own, outside, shared
 from tilestream.model.physics import Physics, width_of
 from tilestream.model.registry import DEFAULT, OF_VIRTUAL_DRIVES, REGRESSORS
 from tilestream.model.regressor import Regressor, held_out_estimates
@@ -304,13 +305,15 @@ def check_making(model: Model, made_with: Mapping[str, Any]) -> list[Outside]:
         raise ModelError(
             "the model was trained without the virtual drive: give observe: null in the config"
         )
+    check_own(model.made_with, made_with, model.factors)
+    made_with = {name: value for name, value in made_with.items() if name != OWN}
     unsaid = sorted(set(made_with) - set(model.made_with))
     if unsaid:
         raise ModelError(
             f"the model does not say for which {' and '.join(unsaid)} it was trained, as those of "
             "older versions do not: train it again"
         )
-    for name in sorted(set(model.made_with) | set(made_with)):
+    for name in sorted((set(model.made_with) | set(made_with)) - {OWN}):
         trained, given = model.made_with.get(name), made_with.get(name)
         if name == "units" and isinstance(trained, Mapping) and isinstance(given, Mapping):
             for factor in model.factors:

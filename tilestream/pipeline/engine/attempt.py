@@ -69,7 +69,8 @@ def perform(task: Task, memory: int | None) -> tuple[Facts, bool]:
             return task.writes.refuse(str(error), task.identity), True
         raise
     whole = made if isinstance(made, Made) else Made(made)
-    return task.writes.write(whole, task.identity, task.applies.columns), True
+    columns = (*task.applies.columns, *whole.columns)
+    return task.writes.write(whole, task.identity, columns), True
 
 
 def _read_counts(task: Task) -> Mapping[str, int]:

@@ -23,6 +23,8 @@ class Made:
 
     value: Any
     facts: dict[str, Any] = field(default_factory=dict)
+    columns: tuple[Column, ...] = ()
+    """What columns mean that this table has beyond those of its stage."""
 
 
 class Stored(NamedTuple):

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from tilestream.crs import require_same
 from tilestream.errors import PartialError, TileNotReadyError
 from tilestream.factors.catalogue import Which
+from tilestream.factors.own import OwnFactors
 from tilestream.factors.rows import Samples, in_route_order, samples_by_tile
 from tilestream.files import place_of
 from tilestream.grid import MM_PER_M, TileGrid, TileKey, whole_mm
@@ -80,6 +81,12 @@ def factors_along(
         LockedError: another process writes to the folder.
         PlanError: a task does not fit `memory`.
         PartialError: some tasks failed; the message lists them, the rest is done.
+
+    Examples:
+        >>> store, route = ts.open_store("map.zarr"), ts.read_route("route.csv")
+        >>> table = ts.factors_along(store, [route], "factors", spacing=2.0)
+        >>> table["arc_length"].tolist()
+        [0.0, 2.0, 4.0, 6.0]
     """
     routes = list(routes)
     looking = Looking(sensor, cell_size, which, sensor_height, route_z)
@@ -162,6 +169,7 @@ def plan_factors(
     memory: int,
     group: str = "",
     applies: Stage = factors,
+    own: Sequence[OwnFactors] = (),
 ) -> Plan:
     """What `factors_along` will run; other arguments and errors as there.
 
@@ -173,12 +181,13 @@ def plan_factors(
         memory: what a task may use [bytes].
         group: of which drive, where one plan has several.
         applies: `factors`, or `factors_drive`.
+        own: factors of one's own.
     """
     map_plan.store.grid.require_cell_size(whole_mm(looking.cell_size, "cell_size"))
     require_near(map_plan, samples)
     folder = place_of(out)
     tasks = [
-        factors_task(map_plan, key, some, looking, folder, group, applies)
+        factors_task(map_plan, key, some, looking, folder, group, applies, own)
         for key, some in samples.items()
     ]
     return Plan.of((*map_plan.tasks.values(), *tasks), memory)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from tilestream.errors import ModelError, SourceNotFoundError, UsageError
+from tilestream.factors.own import OWN, own_factors
 from tilestream.files import Files
 from tilestream.formats.logs import ScanSelection, is_log
 from tilestream.formats.routes import RoutesRead
@@ -276,6 +277,9 @@ def making_of(settings: RunSettings) -> dict[str, Any]:
     making = made_with(COLUMNS, settings.looking_sensor, settings.cell_size)
     making |= {"sensor": settings.vehicle.model_dump(mode="json")}
     making |= {"sensor_height": settings.sensor_height, "map_leaf": _map_leaf(settings)}
+    own = own_factors(settings.factors)
+    if own:
+        making |= {OWN: {c.name: one.hash for one in own for c in one.columns}}
     if settings.observe is None:
         return making
     return making | {
@@ -292,13 +296,16 @@ def _map_leaf(settings: RunSettings) -> float:
 
 
 def check_model(settings: RunSettings) -> None:
-    """Refuse a model in use that cannot estimate these places, before anything is made or measured.
+    """Refuse a model in use that cannot estimate these places, and files of factors that are none,
+    before anything is made or measured.
 
     Raises:
+        UsageError: a file of factors that cannot be; as `own_factors`.
         SourceNotFoundError: there is no such file.
         ModelError: the file is no model, or the model was trained for other factors; says which.
         StoreNotFoundError: the map is to be there and is not.
     """
+    own_factors(settings.factors)
     if settings.model.use is None:
         return
     file = file_of(settings.model.use)

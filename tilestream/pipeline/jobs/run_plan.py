@@ -7,6 +7,7 @@ from typing import Any
 from tilestream.errors import SourceError, SourceNotFoundError, TileNotReadyError
 from tilestream.factors import catalogue
 from tilestream.factors.along_route import REACH
+from tilestream.factors.own import own_factors
 from tilestream.grid import MM_PER_M, TileGrid, TileKey
 from tilestream.model.baselines import Median
 from tilestream.model.dataset import TARGETS
@@ -71,7 +72,8 @@ def plan_measure(settings: RunSettings, inputs: Inputs, map_plan: MapPlan) -> Pl
     memory = settings.memory
     localized, left_out = _localized(settings, inputs, map_plan, tables)
     good = [drive for drive in inputs.drives if drive.group in localized]
-    plans = [plan_factors(map_plan, places, tables, looking_of(settings), memory)]
+    own = own_factors(settings.factors)
+    plans = [plan_factors(map_plan, places, tables, looking_of(settings), memory, own=own)]
     if settings.observe is not None:
         observing = observing_of(settings, settings.observe)
         plans.append(plan_observe(map_plan, places, tables, observing, memory))
@@ -123,8 +125,10 @@ def _plans_of_drives(
         grid, reading, scans = map_plan.store.grid, reading_of(drive), scans_of(drive)
         places = labelled_places(grid, reading, scans, settings.spacing, drive.group)
         folder, memory = f"{settings.out}/tables/drives/{drive.group}", settings.memory
-        looking = replace(looking_of(settings), route_z="lidar")
-        yield plan_factors(map_plan, places, folder, looking, memory, drive.group, factors_drive)
+        looking, own = replace(looking_of(settings), route_z="lidar"), own_factors(settings.factors)
+        yield plan_factors(
+            map_plan, places, folder, looking, memory, drive.group, factors_drive, own
+        )
         if settings.observe is not None:
             observing = observing_drive(settings, settings.observe, drive)
             observing = replace(observing, route_z="lidar")

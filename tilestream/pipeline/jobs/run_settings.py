@@ -56,6 +56,14 @@ ModelPlace = Annotated[str, AfterValidator(_model_place)]
 """A model file, or `shipped`."""
 
 
+def _factors_file(name: str) -> str:
+    return place_of(local_path(name)) if name.endswith(".py") else name
+
+
+FactorsFile = Annotated[str, AfterValidator(_factors_file)]
+"""A file of factors, made absolute here, or the name of an entry point."""
+
+
 class ModelSettings(Settings):
     """How the errors of the measured places become those of all places."""
 
@@ -94,6 +102,9 @@ class RunSettings(PlaceSettings):
     """Files of routes to estimate along; empty: those of the simulation, or of the drives; without
     drives, all lanes of a map directory with `lanelet2_map.osm` among the sources, else the way of
     the logs that the map is made of."""
+    factors: tuple[FactorsFile, ...] = ()
+    """Factors of your own besides ours: Python files (`my_factor.py`), or entry points of the group
+    `tilestream.factors`."""
     observe: VirtualSettings | None = VirtualSettings()
     """How the vehicle's lidar sees in the virtual drive: usable range, blind sector, starts; null:
     no virtual drive, the paper's factors and their twins only."""

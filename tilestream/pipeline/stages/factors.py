@@ -1,9 +1,13 @@
 """Factors: what the map looks like from the sample points of a tile."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 
+import pandas as pd
+
 from tilestream.factors.catalogue import COLUMNS, Which
+from tilestream.factors.own import OWN, OwnFactors, own_table
 from tilestream.factors.rows import PLACE_COLUMNS, STATUS_COLUMNS, Samples, sample_rows, with_places
 from tilestream.factors.table import TermsCache
 from tilestream.factors.table import factors as factors_of
@@ -23,6 +27,9 @@ FIXED_BYTES = CACHE_BYTES + 300_000_000
 """Memory of the task besides what it reads: the kept terms, the sums of some sample points."""
 BYTES_PER_POINT = 40
 """Memory per map point in sight, of which the terms of one tile are made at a time."""
+BYTES_AROUND = 200
+"""Memory per map point that factors of one's own look at, with its order: those of all places of a
+tile at once."""
 
 
 @dataclass(frozen=True)
@@ -44,20 +51,31 @@ class Looking:
 @stage(
     "factors",
     version=3,
-    memory=lambda counts: FIXED_BYTES + BYTES_PER_POINT * counts["largest"],
+    memory=lambda counts: (
+        FIXED_BYTES + BYTES_PER_POINT * counts["largest"] + BYTES_AROUND * counts.get("around", 0)
+    ),
     seconds=0.002,
     columns=(*PLACE_COLUMNS, *COLUMNS, *STATUS_COLUMNS),
 )
-def factors(map_part: MapPart, samples: Samples, looking: Looking) -> Made:
-    """The factors of sample points, a row each."""
+def factors(
+    map_part: MapPart, samples: Samples, looking: Looking, own: Sequence[OwnFactors] = ()
+) -> Made:
+    """The factors of sample points, a row each; those of one's own behind the others."""
     store = map_part.store
     places, why = sample_rows(samples, store, looking.sensor_height, looking.route_z)
     positions = places[["x", "y", "z"]].to_numpy()
     cache = _cache(map_part.store_url, looking.cell_size, map_part.state)
     found = factors_of(store, positions, looking.sensor, looking.cell_size, looking.which, cache)
     facts = {"data_set": canonical(looking), "store": store.address}
-    rows = with_places(found, places, why)
-    return Made(rows, facts)
+    if not own:
+        return Made(with_places(found, places, why), facts)
+    looked = places[["x", "y", "z", "heading"]].assign(status=found["status"])
+    more = own_table(own, store, looked, looking.cell_size)
+    columns = tuple(column for one in own for column in one.columns)
+    told = {OWN: [asdict(column) for column in columns]}
+    rows = with_places(pd.concat([more, found], axis=1), places, why)
+    order = [name for name in rows if name not in more and name not in ("status", "reason")]
+    return Made(rows[[*order, *more, "status", "reason"]], facts | told, columns)
 
 
 @stage(
@@ -67,9 +85,11 @@ def factors(map_part: MapPart, samples: Samples, looking: Looking) -> Made:
     seconds=factors.seconds,
     columns=factors.columns,
 )
-def factors_drive(map_part: MapPart, samples: Samples, looking: Looking) -> Made:
+def factors_drive(
+    map_part: MapPart, samples: Samples, looking: Looking, own: Sequence[OwnFactors] = ()
+) -> Made:
     """The same at the places of the scans of a drive: what its labels are joined with."""
-    made: Made = factors.function(map_part, samples, looking)
+    made: Made = factors.function(map_part, samples, looking, own)
     return made
 
 
@@ -87,6 +107,7 @@ def factors_task(
     folder: str,
     group: str = "",
     applies: Stage = factors,
+    own: Sequence[OwnFactors] = (),
 ) -> Task:
     """The factors of the sample points of a tile, from the terms of the tiles in sight.
 
@@ -98,16 +119,20 @@ def factors_task(
         folder: of the tables.
         group: of which drive, where one plan has several.
         applies: `factors`, or `factors_drive`.
+        own: factors of one's own.
     """
     cell_mm = whole_mm(looking.cell_size, "cell_size")
-    seen = plan.over(Box.around(samples.places, looking.sensor.range_max))
+    reach = max((one.reach for one in own), default=0.0)
+    around = plan.over(Box.around(samples.places, reach)) if own else []
+    seen = plan.over(Box.around(samples.places, max(looking.sensor.range_max, reach)))
     return Task(
         applies,
         "-".join(part for part in (group, str(tile)) if part),
         Parquet(f"{folder}/factors/{tile}.parquet"),
-        takes={"samples": samples, "looking": looking},
+        takes={"samples": samples, "looking": looking} | ({"own": tuple(own)} if own else {}),
         reads={"map_part": plan.part(seen, [plan.terms(key, cell_mm) for key in seen])},
         work=len(samples),
-        counts={"points": plan.count(seen), "largest": plan.largest(seen)},
+        counts={"points": plan.count(seen), "largest": plan.largest(seen)}
+        | ({"around": plan.count(around)} if own else {}),
         tile=tile,
     )

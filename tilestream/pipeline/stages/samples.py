@@ -1,7 +1,7 @@
 """Samples: the factors, virtual drives and labels of the same places, joined once."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -11,6 +11,7 @@ import pandas as pd
 from tilestream.errors import DamagedError, SourceNotFoundError
 from tilestream.factors import catalogue, observability
 from tilestream.factors.along_route import AVERAGED, averaged_along
+from tilestream.factors.own import OWN, columns_in
 from tilestream.factors.rows import PLACE_COLUMNS, STATUS_COLUMNS
 from tilestream.factors.virtual_drive import MOMENT_COLUMNS
 from tilestream.marks import Mark
@@ -87,7 +88,8 @@ class DatasetFile(Parquet):
         seen = dataset.virtual_drives.astype({"sample": np.int64})
         beside = self._beside("virtual_drives")
         write_table(beside, seen, VIRTUAL_COLUMNS, Mark("done", identity=identity))
-        kept = (*DATASET_COLUMNS, *PLACE_COLUMNS, *ERROR_COLUMNS, *features_of(COLUMNS))
+        own = [column for column in dataset.columns if column.factor_set == OWN]
+        kept = (*DATASET_COLUMNS, *PLACE_COLUMNS, *ERROR_COLUMNS, *features_of(COLUMNS), *own)
         names = {column.name for column in kept}
         rows = dataset.rows[[name for name in dataset.rows if name in names]]
         facts = {
@@ -96,6 +98,7 @@ class DatasetFile(Parquet):
             "made_with": dict(dataset.made_with),
             "data_sets": {name: dict(facts) for name, facts in dataset.data_sets.items()},
             "stages": dict(dataset.stages),
+            **({OWN: [asdict(column) for column in own]} if own else {}),
         }
         write_table(self.path, rows, kept, Mark("done", identity=identity, facts=facts))
         return {"rows": len(rows)}
@@ -126,7 +129,7 @@ class DatasetFile(Parquet):
 @lru_cache(maxsize=1)
 def _dataset(file: DatasetFile, identity: str) -> Dataset:  # noqa: ARG001 - another is read again
     facts = read_mark(file.path).facts
-    known = {column.name: column for column in features_of(COLUMNS)}
+    known = {column.name: column for column in (*features_of(COLUMNS), *columns_in(facts))}
     columns = tuple(known[name] for name in facts["features"])
     lost, seen = (read_tables([file._beside(name)]) for name in ("lost", "virtual_drives"))
     rows = read_tables([file.path])
@@ -176,7 +179,7 @@ def samples(
         _rows(routes),
         places,
         {name: _rows(tables) for name, tables in measured.items()},
-        COLUMNS,
+        (*COLUMNS, *columns_in(factors[0].facts if factors else {})),
         made_with=making,
         data_sets={name: tables[0].facts["data_set"] for name, tables in measured.items()},
     )
