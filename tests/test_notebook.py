@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import model_data
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -74,6 +75,15 @@ def test_everything_has_a_table_in_which_names_are_only_text(
     assert "<1>" not in route._repr_html_()
     assert "<td>11.0</td>" in route._repr_html_()
     assert repr(route).startswith("Route r<1> (3 points, 11.0 m")
+
+
+def test_a_dataset_shows_its_first_rows() -> None:
+    found = model_data.dataset(1, lengths={"a<b": 60})
+    page = found._repr_html_()
+    assert repr(found).startswith("Dataset of 60 labelled places on 1 paths, ")
+    assert page.count("<tr>") == 1 + notebook.MOST_ROWS
+    assert f"and {60 - notebook.MOST_ROWS} more" in page
+    assert "a&lt;b" in page
 
 
 def test_a_new_figure_has_metres_to_scale(route: ts.Route) -> None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tilestream.errors import ModelError, UsageError
 from tilestream.factors.along_route import AVERAGED, averaged_along
+from tilestream.notebook import html_table
 from tilestream.records import Column, Float64, Int64
 from tilestream.sensor import Sensor
 
@@ -35,7 +36,7 @@ VIRTUAL_DRIVES = ("group", "route_id", "sample", "arc_length", "status", *AVERAG
 """What is kept of the virtual drives of all places of the drives."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Dataset:
     """Labelled sample points: a row per drive (group) and place, in one order whatever came in.
 
@@ -69,6 +70,16 @@ class Dataset:
 
     def __len__(self) -> int:
         return len(self.rows)
+
+    def __repr__(self) -> str:
+        paths, lost = len(set(self.rows["path"])), len(self.lost)
+        return (
+            f"Dataset of {len(self):,} labelled places on {paths} paths, {len(self.names)} features"
+            f" ({lost:,} labels lost)"
+        )
+
+    def _repr_html_(self) -> str:
+        return html_table(repr(self), list(self.rows), self.rows.to_numpy(object).tolist())
 
     @property
     def names(self) -> list[str]:

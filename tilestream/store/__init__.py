@@ -448,6 +448,14 @@ def open_store(url: str | os.PathLike[str]) -> TileStore:
         DamagedError: the store's own record is not what was written.
         StoreError: something else lies there.
         UsageError: a file lies there, or where a folder above it would be.
+
+    Examples:
+        >>> store = ts.open_store("map.zarr")
+        >>> store.keys()
+        [TileKey(ix=0, iy=-1), TileKey(ix=0, iy=0)]
+        >>> tile = store.tile_at(5.0, 1.0)
+        >>> tile.points().shape[1], tile.cells().cell_size
+        (3, 2.0)
     """
     place = place_of(url)
     return TileStore(place, read_record(place).settings)
