@@ -46,6 +46,7 @@ def put(path: Path, frame: pd.DataFrame, columns: tuple[Column, ...]) -> None:
 
 def write_run(folder: Path) -> Path:
     """Five estimates (the last place has none), two labels, one factor, and the map."""
+    folder.mkdir(exist_ok=True)
     write_pcd(folder / "street.pcd", scene("canyon", 1, spacing=0.8))
     ts.ingest([str(folder / "street.pcd")], folder / "map.zarr", tile_size=40.0)
     done = {"status": "done", "reason": ""}

@@ -149,6 +149,10 @@ def explain(name: str) -> Explanation:
 
     Raises:
         UsageError: nothing has this name; the message tells the nearest ones.
+
+    Examples:
+        >>> "Place of the lidar" in str(ts.explain("x"))
+        True
     """
     wanted = " ".join(name.split()).lower()
     found = [entry for entry in entries() if wanted in _names(entry)]

@@ -43,6 +43,10 @@ def disc_starts(radius: float = 2.0, step: float = 0.2) -> Float64:
 
     Raises:
         UsageError: not whole millimetres, a negative radius, a step that is not positive.
+
+    Examples:
+        >>> ts.disc_starts(radius=0.2, step=0.2).shape
+        (5, 2)
     """
     radius_mm, step_mm = whole_mm(radius, "radius"), whole_mm(step, "step")
     if radius_mm < 0 or step_mm <= 0:

@@ -81,5 +81,11 @@ def cells_of(points: ArrayLike, cell_size: float = 2.0, min_points: int = MIN_PO
     Raises:
         UsageError: points of another shape or not finite, a cell size that is not a positive
             number of whole millimetres, `min_points` below 2.
+
+    Examples:
+        >>> points = np.random.default_rng(0).normal([1.0, 1.0, 1.0], 0.1, (50, 3))
+        >>> cells = ts.cells_of(points)
+        >>> len(cells), cells.index[0].tolist(), cells.count[0].item()
+        (1, [0, 0, 0], 50)
     """
     return cells_of_mm(to_mm(points), whole_mm(cell_size, "cell_size"), min_points)

@@ -113,6 +113,11 @@ def choices_of(
 
     Raises:
         UsageError: as `Choice`.
+
+    Examples:
+        >>> choices = ts.choices_of([ts.VLP16], [30.0, 60.0], [0.0], [2.0])
+        >>> [choice.name for choice in choices]
+        ['VLP16-30m-cell2m', 'VLP16-60m-cell2m']
     """
     product = itertools.product(sensors, ranges, blind_rears_deg, scan_leaves, cell_sizes)
     return tuple(

@@ -55,6 +55,10 @@ def diff(
         StoreNotFoundError: nothing there.
         UsageError: tiles of different size, which cannot be compared.
         CrsError: maps in two CRS.
+
+    Examples:
+        >>> ts.diff("map.zarr", "map.zarr").same
+        2
     """
     before, after = map_of(old), map_of(new)
     if before.settings.tile_size != after.settings.tile_size:

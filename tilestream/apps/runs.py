@@ -51,7 +51,8 @@ def read_run(place: str | os.PathLike[str]) -> pd.DataFrame:
     `measured_p_fail`, `measured_floor`, `measured_tail`, `measured_along`, `measured_across`,
     `measured_up`; on which `drive`, and `measured_distance` [m] from the place); the estimates
     (`estimate`, `low`, `high`, `p_fail`, `floor`, …, `in_domain`, `status`, `reason`); the factors.
-    `ts.explain(NAME)` says what each means. What a job did not make has no column or is NaN.
+    `ts.explain("floor")` says what a column of the tables means; `measured_floor` is what that
+    estimates. What a job did not make has no column or is NaN.
 
     A measured scan counts at the nearest place within 5 m, and of several the nearest; a place has
     one label, of one drive. One that is near no place has a row of its own, with the drive as
@@ -68,6 +69,11 @@ def read_run(place: str | os.PathLike[str]) -> pd.DataFrame:
         SourceNotFoundError: no tables there.
         IncompleteError: a table that must be there is not: the job has not ended.
         DamagedError: a table is not what was written.
+
+    Examples:
+        >>> table = ts.read_run("run")
+        >>> table[["sample", "measured", "estimate"]].iloc[:2].to_numpy().tolist()
+        [[0.0, nan, 0.1], [1.0, 0.3, 0.2]]
     """
     table = with_labels(_places(place), _labels(place))
     if table.empty and not len(table.columns):
@@ -96,7 +102,8 @@ def _places(place: str | os.PathLike[str]) -> pd.DataFrame:
     folder = Files.at(place)
     report = folder.under("report/places.parquet")
     if report.there() and told_before(folder.under(RECORD)).get("state") in ENDED:
-        return pd.read_parquet(io.BytesIO(report.read())).drop(columns="geometry", errors="ignore")
+        shown = pd.read_parquet(io.BytesIO(report.read()))
+        return shown.drop(columns=["geometry", *OF_LABEL], errors="ignore")
     tables = [rows_of(place, name) for name in ("factors", "observability", "predictions")]
     found = pd.DataFrame()
     for table in tables:
@@ -244,6 +251,12 @@ def open_run(place: str | os.PathLike[str]) -> Run:
 
     Raises:
         SourceNotFoundError: nothing there. What is read later raises as `read_run`.
+
+    Examples:
+        >>> run = ts.open_run("run")
+        >>> axes = run.plot()  # the street, coloured by error
+        >>> int(run.table["measured"].notna().sum())
+        2
     """
     if not Files.at(place).there():
         raise SourceNotFoundError(f"{place}: no such run directory")

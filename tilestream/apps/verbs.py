@@ -25,8 +25,9 @@ SHIPPED = resources.files("tilestream") / "data"
 def template() -> str:
     """A job for your city, as the text of a YAML file that explains every setting.
 
-    >>> template().startswith("#")
-    True
+    Examples:
+        >>> ts.template().startswith("# A job for your city")
+        True
     """
     return (SHIPPED / "city.yaml").read_text()
 
@@ -45,6 +46,11 @@ def plan(config: RunSettings | str | os.PathLike[str]) -> pd.DataFrame:
     Raises:
         PlanError: a task does not fit `memory`.
         UsageError, SourceError, StoreError, ModelError: as the job itself.
+
+    Examples:
+        >>> planned = ts.plan("job.yaml")
+        >>> planned.set_index("stage").loc["predict", "work"].item()
+        7
     """
     expected = forecast(config if isinstance(config, RunSettings) else read_settings(config))
     table = pd.DataFrame(
@@ -128,6 +134,10 @@ def status(store: str | os.PathLike[str]) -> Condition:
 
     Raises:
         StoreError: as `ts.open_store`.
+
+    Examples:
+        >>> str(ts.status("map.zarr"))
+        'whole'
     """
     return open_store(store).condition()
 

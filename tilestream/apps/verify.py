@@ -48,6 +48,11 @@ def verify(place: str | os.PathLike[str]) -> tuple[int, list[Damage]]:
 
     Raises:
         UsageError: nothing of ours lies there.
+
+    Examples:
+        >>> read, damaged = ts.verify("map.zarr")
+        >>> damaged
+        []
     """
     found = list(_below(place_of(place)))
     if not found:

@@ -129,6 +129,12 @@ def factors(
     Raises:
         UsageError: positions of another shape or not finite, an unknown set, a cell size of which
             the tile size is no multiple.
+
+    Examples:
+        >>> store = ts.open_store("map.zarr")
+        >>> table = ts.factors(store, [[5.0, 0.5, 2.0], [7.0, 0.5, 2.0]])
+        >>> table.shape, table["status"].tolist()
+        ((2, 22), ['done', 'done'])
     """
     places = places_of(positions)
     if which not in get_args(Which):

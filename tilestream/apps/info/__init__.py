@@ -30,6 +30,10 @@ def info(path: str | os.PathLike[str], log_options: LogOptions | None = None) ->
         SourceNotFoundError: nothing there.
         UnknownFormatError: nothing that tilestream reads.
         TilestreamError: it is damaged, or cannot be read; as its own reader says.
+
+    Examples:
+        >>> ts.info("route.csv").plain()["kind"]
+        'routes'
     """
     name = os.fspath(path)
     names = frozenset(Files.at(name).names())

@@ -186,6 +186,11 @@ def read_route(
 
     Raises:
         SourceError: several routes and no id, or none with this id; names those that are there.
+
+    Examples:
+        >>> route = ts.read_route("route.csv")
+        >>> route
+        Route route (2 points, 6.0 m, CRS None)
     """
     read = read_all_routes(
         path,

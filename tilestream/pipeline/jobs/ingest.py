@@ -92,6 +92,11 @@ def ingest(
         PlanError: the job does not fit `memory`.
         PartialError: some sources or tiles failed; the message lists them with reasons, and
             the rest is done and can be opened.
+
+    Examples:
+        >>> store = ts.ingest(["street.pcd"], "small.zarr", tile_size=20.0)
+        >>> store.settings.tile_size, store.condition().whole
+        (20.0, True)
     """
     settings = IngestSettings(
         tile_size=tile_size, halo=halo, map_leaf=map_leaf, crs=crs, keep_noise=keep_noise
