@@ -1,4 +1,4 @@
-"""Progress on stderr while a job runs: bars on a terminal, else a line now and then."""
+"""Progress while a job runs: bars on a terminal and in a notebook, else a line now and then."""
 
 import sys
 import time
@@ -39,8 +39,14 @@ class Rate(ProgressColumn):
 
 @contextmanager
 def progress() -> Iterator[Watch]:
-    """Progress of each stage on stderr; failures are printed as they happen."""
-    with _bars() if err.is_terminal else _lines() as show:
+    """Progress of each stage while a job runs, on stderr or in a notebook; failures are printed as
+    they happen.
+
+    Examples:
+        >>> with ts.progress() as watch:
+        ...     store = ts.ingest(["street.pcd"], "small.zarr", tile_size=20.0, watch=watch)
+    """
+    with _bars() if err.is_terminal or err.is_jupyter else _lines() as show:
 
         def watch(outcome: Outcome, ended: int, total: int) -> None:
             show(outcome.stage, ended, total)
@@ -77,6 +83,7 @@ def _bars() -> Iterator[Show]:
             yield show
         finally:
             bar.update(waiting, visible=False)
+            bar.refresh()  # a notebook would keep what it showed last
 
 
 @contextmanager
