@@ -27,6 +27,7 @@ from tilestream.model.training import ESTIMATES, MAIN, PREDICTION_COLUMNS
 from tilestream.notebook import axes_of, html_of
 from tilestream.pipeline.jobs.run_book import RECORD, told_before
 from tilestream.pipeline.jobs.run_folder import map_of, rows_of, table_paths
+from tilestream.records import Float64
 from tilestream.report.colours import MISSING, palette, scale_of
 from tilestream.store import TileStore
 from tilestream.tables import read_tables
@@ -209,17 +210,16 @@ class Run:
         table = self.table
         if column is not None and (column not in table or table[column].dtype.kind not in "iufb"):
             raise UsageError(f"{self.place}: {column!r} is no column of numbers: see `.table`")
-        blank = pd.Series(np.nan, table.index)
-        small = table.get("estimate" if column is None else column, blank).astype(np.float64)
-        large = table.get("measured", blank) if column is None else blank
-        scale = scale_of(large.fillna(small).to_numpy(np.float64))
+        small = _numbers(table, column or "estimate")
+        large = _numbers(table, "measured" if column is None else "")
+        scale = scale_of(np.where(np.isnan(large), small, large))
         ax, colours = axes_of(ax), np.array([*palette(), MISSING])
-        for values, size in ((small, 8.0), (large.astype(np.float64), 30.0)):
-            rows = np.flatnonzero(values.notna())
-            rows = rows[np.argsort(values.to_numpy()[rows], kind="stable")]  # the worst on top
-            shade = colours[scale.step(values.to_numpy(np.float64)[rows])]
+        for values, size in ((small, 8.0), (large, 30.0)):
+            rows = np.flatnonzero(~np.isnan(values))
+            rows = rows[np.argsort(values[rows], kind="stable")]  # the worst on top
+            shade = colours[scale.step(values[rows])]
             ax.scatter(table["x"].iloc[rows], table["y"].iloc[rows], s=size, c=shade.tolist(), lw=0)
-        neither = table[small.isna() & large.isna()]
+        neither = table[np.isnan(small) & np.isnan(large)]
         ax.scatter(neither["x"], neither["y"], s=12.0, c=MISSING, marker="x", lw=1.0)
         shades = import_module("matplotlib.colors").ListedColormap(palette())
         ramp = import_module("matplotlib.cm").ScalarMappable(cmap=shades)
@@ -241,6 +241,13 @@ class Run:
         if self.report:
             facts["report"] = f"{self.place}/report/index.html"
         return html_of(f"Run {self.place}", facts)
+
+
+def _numbers(table: pd.DataFrame, name: str) -> Float64:
+    """(n,) a column; NaN where the table has none of that name."""
+    if name not in table:
+        return np.full(len(table), np.nan)
+    return table[name].to_numpy(np.float64)
 
 
 def open_run(place: str | os.PathLike[str]) -> Run:

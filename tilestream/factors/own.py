@@ -230,6 +230,5 @@ def _within(positions: Float64, place: Float64, reach: float) -> NDArray[np.bool
 
 
 def _some(cells: Cells, which: NDArray[np.bool_]) -> Cells:
-    parts = (cells.index, cells.count, cells.mean, cells.covariance)
-    index, count, mean, covariance = (part[which] for part in parts)
-    return Cells(index, count, mean, covariance, cells.cell_size)
+    index, count = cells.index[which], cells.count[which]
+    return Cells(index, count, cells.mean[which], cells.covariance[which], cells.cell_size)

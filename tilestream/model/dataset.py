@@ -79,7 +79,9 @@ class Dataset:
         )
 
     def _repr_html_(self) -> str:
-        return html_table(repr(self), list(self.rows), self.rows.to_numpy(object).tolist())
+        return html_table(
+            repr(self), [str(name) for name in self.rows], self.rows.to_numpy(object).tolist()
+        )
 
     @property
     def names(self) -> list[str]:
