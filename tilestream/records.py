@@ -369,3 +369,8 @@ class LocalizationError:
     def iterations(self) -> Int64:
         """(k,) Newton steps taken."""
         return self.registrations.iterations
+
+
+District = Literal["shinjuku", "sendagaya"]
+"""A district that ships with tilestream: the one of the paper's five paths, or another with three
+streets."""

@@ -18,7 +18,7 @@ from tilestream.config import Settings
 from tilestream.errors import UsageError
 from tilestream.files import local_path, place_of
 from tilestream.matcher import MATCHERS, Positive, RegistrationSettings, matcher_named
-from tilestream.records import RouteZ, TruePose
+from tilestream.records import District, RouteZ, TruePose
 from tilestream.sensor import SENSORS, Carrier, Mount, Sensor, Vehicle, named
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -280,9 +280,8 @@ class LabelSettings(Settings):
 class SimulateSettings(Settings):
     """A simulated city instead of real files: its survey is the map, its drives are measured."""
 
-    city: Literal["shinjuku", "sendagaya"] = "shinjuku"
-    """A district that ships with tilestream: `shinjuku` has the paper's five paths, `sendagaya`
-    three streets of another one."""
+    city: District = "shinjuku"
+    """The district: `shinjuku` has the paper's five paths, `sendagaya` three other streets."""
     preset: str = "physical"
     """`physical`, `paper`, or a YAML file of simulation settings."""
     size: Literal["full", "small"] = "full"

@@ -16,7 +16,8 @@ from tilestream.pipeline.jobs import run as main_job
 from tilestream.pipeline.jobs import simulate as simulation
 from tilestream.pipeline.jobs.forecast import forecast
 from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
-from tilestream.simulation.settings import load_preset
+from tilestream.records import District
+from tilestream.simulation.settings import settings_in
 from tilestream.store import Condition, open_store
 
 SHIPPED = resources.files("tilestream") / "data"
@@ -85,24 +86,30 @@ def stage_rows(tasks: Sequence[Task]) -> list[dict[str, object]]:
 def simulate(
     out: str | os.PathLike[str],
     *,
+    city: District = "shinjuku",
     preset: str = "physical",
     drive: int = 0,
     seed: int = 0,
     paths: Sequence[str] | None = None,
     scans_per_point: int = 1,
+    every: int = 1,
+    survey_of: str | os.PathLike[str] | None = None,
     size: simulation.Size = "full",
     client: Any | None = None,
     watch: Watch | None = None,
 ) -> Path:
-    """Simulate a survey of Shinjuku and drives through it; a killed simulation continues.
+    """Simulate a survey of a district and drives through it; a killed simulation continues.
 
     Args:
         out: the directory of the map (`survey/`), the logs (`logs/`) and `routes.geojson`.
+        city: `shinjuku`, with the paper's five paths, or `sendagaya`, three other streets.
         preset: `physical`, `paper`, or a YAML file of simulation settings.
         drive: its number: another one of the same seed drives the same streets again.
         seed: of everything that is simulated.
         paths: only these streets; None: all.
         scans_per_point: turns of the lidar kept at each sample point.
+        every: only each so-many-th sample point is scanned.
+        survey_of: the directory of a simulation of the same city whose survey is the map.
         size: `small`: the first 40 m of each path and a thin survey.
         client: a Dask client to run on; None: this process.
         watch: is told of each task that ended.
@@ -114,12 +121,14 @@ def simulate(
         SourceNotFoundError: no such preset or file.
         UsageError, PlanError, LockedError, PartialError: as `simulation.simulate`.
     """
-    settings = load_preset(preset).model_copy(update={"drive": drive, "seed": seed})
+    settings = settings_in(city, preset).model_copy(update={"drive": drive, "seed": seed})
     return simulation.simulate(
         settings,
         Path(out),
         paths=paths,
         scans_per_point=scans_per_point,
+        every=every,
+        survey_of=None if survey_of is None else os.fspath(survey_of),
         size=size,
         client=client,
         watch=watch,

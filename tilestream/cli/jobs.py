@@ -3,7 +3,7 @@
 import io
 import json
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import pandas as pd
 import typer
@@ -25,6 +25,7 @@ from tilestream.pipeline.jobs.run_book import RECORD, told_before
 from tilestream.pipeline.jobs.run_inputs import extent, simulations
 from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
 from tilestream.pipeline.stages.simulated import SCENE_BYTES
+from tilestream.records import District
 from tilestream.report import cards, gate
 from tilestream.report.drives import EVALUATED, DriveMeasured
 from tilestream.report.measured import MEASURES, check_measure
@@ -295,9 +296,7 @@ def show_plan(settings: RunSettings, as_json: bool) -> None:
 @on_cluster
 @with_settings
 def simulate(
-    city: Annotated[
-        Literal["shinjuku", "sendagaya"], typer.Argument(help="A district that ships with us.")
-    ],
+    city: Annotated[District, typer.Argument(help="A district that ships with us.")],
     folder: Annotated[str, typer.Option("--out", help="Folder of map, logs and routes.")],
     what: Annotated[
         SimulateSettings, fields("preset", "scans_per_point", "every", "survey_of", "seed", "size")

@@ -13,11 +13,11 @@ from tilestream.bounded_yaml import read_yaml
 from tilestream.config import Settings
 from tilestream.errors import SourceNotFoundError, UsageError
 from tilestream.files import local_path
-from tilestream.records import Float64
+from tilestream.records import District, Float64
 from tilestream.sensor import SENSORS, Sensor, Vehicle, named
 
-SHINJUKU = "shinjuku"
-"""The district that presets name, of the paper's five paths."""
+OF_PRESETS: District = "shinjuku"
+"""The district whose files presets name; a preset of one's own may name others."""
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Length = Annotated[float, Field(ge=0.0)]
@@ -190,3 +190,11 @@ def load_preset(name: str) -> SimulationSettings:
         return SimulationSettings(**values)
     except (TypeError, UsageError) as error:
         raise UsageError(f"{name}: {error}") from None
+
+
+def settings_in(city: District, preset: str) -> SimulationSettings:
+    """A preset (`load_preset`, which says what it raises) in a district that ships."""
+    known = load_preset(preset)
+    if city == OF_PRESETS:
+        return known
+    return known.model_copy(update={"city": known.city.of_district(city)})

@@ -35,7 +35,7 @@ from tilestream.settings import (
     SimulateSettings,
     VirtualSettings,
 )
-from tilestream.simulation.settings import SHINJUKU, SimulationSettings, load_preset
+from tilestream.simulation.settings import SimulationSettings, load_preset, settings_in
 from tilestream.store import open_store
 
 LEADS_ON = f"; without a model the virtual drive makes the estimates: model {UNTRAINED}"
@@ -135,9 +135,7 @@ def _other_lidars(settings: RunSettings) -> list[str]:
 
 def simulations(wanted: SimulateSettings) -> list[SimulationSettings]:
     """The experiment of each drive."""
-    preset = load_preset(wanted.preset).model_copy(update={"seed": wanted.seed})
-    if wanted.city != SHINJUKU:  # a preset of one's own may name other files
-        preset = preset.model_copy(update={"city": preset.city.of_district(wanted.city)})
+    preset = settings_in(wanted.city, wanted.preset).model_copy(update={"seed": wanted.seed})
     return [preset.model_copy(update={"drive": drive}) for drive in range(wanted.drives)]
 
 
