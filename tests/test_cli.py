@@ -738,11 +738,19 @@ def test_localize_refuses_what_cannot_be(
 def test_the_demo_ends_with_a_report(tmp_path: Path, capsys: Told) -> None:
     assert run(["demo", "--out", str(tmp_path / "demo")]) == 0
     page = tmp_path / "demo" / "report" / "index.html"
-    assert f"The report is at {page}" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert f"The report is at {page}" in told
+    assert "the model that ships" in told
     assert "PLATEAU" in page.read_text()
-    dataset = ts.dataset(tmp_path / "demo")
-    assert len(dataset) >= 115
-    assert set(dataset.rows["path"]) == {"I", "III", "V"}
+    assert len(ts.dataset(tmp_path / "demo")) >= 55
+    report = json.loads((tmp_path / "demo" / "report" / "report.json").read_text())
+    assert report["crs"] is not None
+    assert "6677" in report["crs"]
+    head = report["headline"]
+    assert head["estimated"] >= 290
+    assert head["measured"] >= 55
+    assert head["max"] > 2.0 * head["median"]  # the hot spots stand out
+    assert report["worst"][0]["reason"]
 
 
 # --- Real data

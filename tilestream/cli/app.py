@@ -83,7 +83,7 @@ COMMANDS = {
     ),
     "demo": (
         "jobs",
-        "The main job on a few streets of Shinjuku, simulated first: needs minutes and no files.",
+        "A street of Shinjuku from its map alone, and what a drive measures: minutes, no files.",
     ),
 }
 """The file of each command, and what the list of commands says of it."""

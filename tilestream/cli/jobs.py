@@ -323,5 +323,5 @@ def demo(
     folder: Annotated[str, typer.Option("--out", help="The run directory.")] = "tilestream-demo",
     workers: AllCores = None,
 ) -> None:
-    """The main job on a few streets of Shinjuku, simulated first: needs minutes and no files."""
+    """A street of Shinjuku from its map alone, and what a drive measures: minutes, no files."""
     show_report(do_job(verbs.demo_settings(folder), Cluster(workers=workers)))

@@ -182,6 +182,9 @@ def _refuse_other_versions(place: str, facts: Mapping[str, Any]) -> None:
             f"{place}: of format {facts['format_version']}, and this tilestream ({VERSION}) reads "
             f"{FORMAT_VERSION}: train it again"
         )
+    recipe = REGRESSORS.get(facts["facts"]["recipe"])
+    if recipe is not None and not recipe.types:  # numbers alone, which any version reads
+        return
     written, here = (v.split(".")[:2] for v in (facts["sklearn"], sklearn.__version__))
     if written != here:
         raise ModelError(

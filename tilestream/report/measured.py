@@ -78,7 +78,9 @@ def with_measured(places: pd.DataFrame, labels: pd.DataFrame, reach: float) -> p
     for _, drive in drives:
         near = nearest_along(at, drive[["path", "arc_length", *names]], reach)
         found[names] = np.fmax(found[names], near[names])
-    return places.assign(**{measured_column(m): found[label] for m, label in MEASURES.items()})
+    named = {label: measured_column(measure) for measure, label in MEASURES.items()}
+    kept = places.drop(columns=list(named.values()), errors="ignore")
+    return pd.concat([kept, found.rename(columns=named)], axis=1)
 
 
 def check_measure(name: str) -> None:

@@ -39,6 +39,8 @@ from tilestream.store import TileStore
 from tilestream.tables import read_tables
 
 PLACE = ["route_id", "sample"]
+ROUNDING = 1e-6
+"""How far a label may be beyond half a spacing of the place that has it [m]."""
 _NO_POINTS = pd.DataFrame({name: [] for name in ("row", "estimate", "low", "high")})
 """Where nothing could be held out."""
 
@@ -259,7 +261,7 @@ def findings_of(
     )
     worth = _worth(done, settings, estimator, (places, labels, tables["protocols"]))
     own = labels if labels.empty else labels[~labels["group"].isin(list(otherwise))]
-    places = with_measured(places, own, settings.spacing)
+    places = with_measured(places, own, 0.5 * settings.spacing + ROUNDING)
     gathered = Findings(
         title=settings.report.title or settings.folder.name,
         places=places,
