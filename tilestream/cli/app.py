@@ -58,7 +58,7 @@ COMMANDS = {
     ),
     "simulate": (
         "jobs",
-        "Simulate a survey of Shinjuku and drives through it; a killed run continues.",
+        "Simulate a survey of a district and drives through it; a killed run continues.",
     ),
     "explain": (
         "explain",
