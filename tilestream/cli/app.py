@@ -35,7 +35,7 @@ MARKUP: Any = "markdown"  # the other mode takes [m] for a style
 COMMANDS = {
     "estimate": (
         "jobs",
-        "From a map alone to the localization error everywhere, and its report: begin here.",
+        "From a map alone to the localization error everywhere: nobody has to drive there first.",
     ),
     "ingest": ("maps", "Make a tile store from point clouds, map directories and logs of drives."),
     "status": ("maps", "Show the tiles of a store: counts, extents, status and reasons."),

@@ -258,7 +258,9 @@ def lost_labels(report: dict[str, Any]) -> list[str]:
     return [f"{total:,} of {of:,} measured places are not used:", *reasons]
 
 
-def require_within(folder: Files, limit: float, measure: str, over: Over) -> None:
+def require_within(
+    folder: Files, limit: float, measure: str = "mean", over: Over = "places"
+) -> None:
     """Fail where the error exceeds a limit, or is not known: a gate for a map release.
 
     Raises:
