@@ -19,7 +19,9 @@ def options() -> argparse.Namespace:
     )
     parser.add_argument("retrained", type=Path, help="the folder of the retraining")
     parser.add_argument("--json", type=Path, help="write all figures into this file too")
-    parser.add_argument("--competitors", nargs="+", default=["corrected", "physics", "forest"])
+    parser.add_argument(
+        "--competitors", nargs="+", default=["corrected", "physics", "forest"], help="models"
+    )
     return parser.parse_args()
 
 
@@ -38,6 +40,7 @@ from tilestream.model.evaluation import held_out
 from tilestream.model.figures import difference, with_spans
 from tilestream.model.intervals import coverage
 from tilestream.model.physics import Physics
+from tilestream.model.registry import OF_VIRTUAL_DRIVES
 from tilestream.model.splits import protocols_of
 from tilestream.pipeline.jobs.train_over import dataset_over
 
@@ -59,7 +62,8 @@ def datasets(folder: Path) -> dict[str, tuple[Dataset, tuple[str, ...]]]:
             and "autoware" in name
             and not any(lesser in name for lesser in ("-short-", "-near-", "-8-"))
         }
-        found[preset] = dataset_over(kept), ("path", "blocks")
+        if kept:
+            found[preset] = dataset_over(kept), ("path", "blocks")
     found["all runs"] = dataset_over(runs), ("path", "lidar", "district")
     return found
 
@@ -149,11 +153,11 @@ def main(given: argparse.Namespace) -> None:
         print(
             f"\n### {name}: {len(dataset)} places, {len(set(dataset.pieces))} blocks\n", flush=True
         )
-        known = ["corrected", "physics"] if name == "all runs" else given.competitors
+        known = [one for one in given.competitors if one in OF_VIRTUAL_DRIVES or name != "all runs"]
         rows, points = judged(dataset, protocols, known)
         told(rows)
         every[name] = rows
-        if name == "all runs":
+        if len(points) and name == "all runs":
             by_lidar(dataset, points)
         if given.json:
             given.json.write_text(json.dumps(every, indent=1))

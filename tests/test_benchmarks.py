@@ -21,6 +21,7 @@ from tilestream.pipeline.jobs.run_settings import read_settings
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "benchmarks"
 SCRIPTS = sorted(path.name for path in FOLDER.glob("*.py") if "__main__" in path.read_text())
+SHIPPED = ROOT / "tilestream" / "data"
 DOCUMENTS = (FOLDER / "RESULTS.md", ROOT / "pipelines" / "README.md")
 SMALLEST = (
     "drive.py canyon.mcap --figures figures",
@@ -36,9 +37,10 @@ SMALLEST = (
     "raycast.py --metres 1 --rounds 1",
     "registration.py --starts 1",
     "scale.py --tiles 1 --size 20",
+    f"sendagaya.py {SHIPPED}/sendagaya_buildings.geojson.gz .",
     "shinjuku_labels.py --size small --paths III --every 40 --out labels",
     "shinjuku_labels.py --size small --paths III --every 40 --out labels --knobs drive",
-    "shinjuku_routes.py routes.geojson",
+    "shinjuku_routes.py .",
     "simulate.py --metres 1",
     "trust.py --blocks 1 --rounds 1",
     "virtual_drive.py cost --tiles 1 --spacing 0.5",
@@ -47,6 +49,7 @@ SMALLEST = (
 OF_A_FINISHED_RUN = (
     "drive_estimate.py drive",
     "experiment.py city",
+    "over_runs.py retrained --competitors physics",
     "predict.py --run city",
     "virtual_drive.py city city --every 20",
 )
@@ -179,6 +182,9 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     drive = [f"out={folder}/drive", f"map.sources=[{log}]", f"drives=[{seen}, {blind}]"]
     physics = ["model.use=null", "model.recipe=physics"]
     ts.run(read_settings(ROOT / "pipelines" / "drive.yaml", drive + few + physics))
+    retrained = folder / "retrained" / "runs"
+    retrained.mkdir(parents=True)
+    (retrained / "shinjuku-paper-0-VLP16-2m-autoware").symlink_to(folder / "city")
     return folder
 
 
