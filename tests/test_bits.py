@@ -245,6 +245,7 @@ MAY = {
     "model/figures.py": "over the blocks of all labelled places",
     "model/intervals.py": "over the blocks of all labelled places",
     "model/repeats.py": "over the blocks of all labelled places",
+    "notebook.py": "a picture, no table",
     "registration.py": "3 x 3 of one pose or one cell",
     "report/log_poses.py": "over one drive",
     "sensor.py": "3 x 3 of one mount",
