@@ -276,6 +276,7 @@ def intervals(table: pd.DataFrame) -> dict[str, dict[str, dict[str, Figure]]]:
     unlike its training, and how large the estimates and the errors are.
     """
     error = table["error_mean"]
+    said, actual = table["said"].to_numpy(np.float64), error.to_numpy(np.float64)
     held = ((table["low"] <= error) & (error <= table["high"])).to_numpy(np.float64)
     strange = (~table["in_domain"].astype(bool)).to_numpy(np.float64)
     done, off = table["said"].notna().to_numpy(), (table["said"] - error).abs().to_numpy()
@@ -290,8 +291,9 @@ def intervals(table: pd.DataFrame) -> dict[str, dict[str, dict[str, Figure]]]:
                 "held": figure(table, rows, lambda some: float(held[some].mean())),
                 "out_of_domain": figure(table, rows, lambda some: float(strange[some].mean())),
                 "off": figure(table, rows, lambda some: float(off[some].mean())),
-                "estimated": {"value": float(np.median(table["said"].to_numpy()[rows]))},
-                "measured": {"value": float(np.median(error.to_numpy()[rows]))},
+                "spearman": figure(table, rows, lambda some: spearman(said[some], actual[some])),
+                "estimated": {"value": float(np.median(said[rows]))},
+                "measured": {"value": float(np.median(actual[rows]))},
             }
     return found
 

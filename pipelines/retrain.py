@@ -219,7 +219,8 @@ def on_real_drives(found: dict[str, Any]) -> dict[str, Any]:
     error, and both and the level (estimated / measured, medians) by lidar.
     """
     streets = [name for name in found["pooled"] if name != "all"]
-    pooled, of_model = found["pooled"]["all"], found["model"]["all"]
+    of_model = found["model"]["all"]
+    pooled = of_model["all"]["spearman"]
     lidars = {name: one for name, one in of_model.items() if name != "all"}
     held = {
         name: [one["held"][k] for k in ("value", "standard_error")]

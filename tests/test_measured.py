@@ -45,7 +45,7 @@ def test_the_nearest_label_counts_and_of_drives_the_largest() -> None:
         for path in ("a", "b")
     ]
     known, table = pd.concat(drives, ignore_index=True), places()
-    found = with_measured(table, known, 0.7)["measured_mean"]
+    found = with_measured(table, known, 0.7)["measured"]
     assert found.to_numpy() == pytest.approx(literal(table, known, 0.7), nan_ok=True)
     assert 0 < found.notna().sum() < len(table)
 

@@ -8,6 +8,7 @@ import matplotlib as mpl
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
 from hand_made_run import LABELS, PLACES, write_run
 from hypothesis import given
 from hypothesis import strategies as st
@@ -58,6 +59,26 @@ def test_a_drive_without_routes_has_rows_of_its_own(folder: Path, tmp_path: Path
     assert table["measured"].tolist() == [0.3, 0.7]
     assert table["x"].tolist() == pytest.approx([5.2, 8.2])
     assert table["status"].tolist() == ["done", "done"]
+
+
+@pytest.mark.usefixtures("without_geopandas")
+def test_what_a_lesser_lidar_measured_does_not_stand_beside_estimates(
+    folder: Path, tmp_path: Path
+) -> None:
+    """The labels of `day` are of a drive that is read as 8 beams; the job estimates for 16."""
+    shutil.copytree(folder, tmp_path / "run")
+    job = {"out": str(tmp_path / "run"), "map": {"store": str(tmp_path / "run" / "map.zarr")}}
+    drive = {"log": "drive.mcap", "name": "day"}
+    for more, known in (({}, len(LABELS)), ({"beams": 8}, 0)):
+        told = yaml.safe_dump({**job, "drives": [{**drive, **more}]})
+        (tmp_path / "run" / "config.yaml").write_text(told)
+        table = ts.read_run(tmp_path / "run")
+        assert len(table) == PLACES
+        measured = table["measured"].notna().sum() if "measured" in table else 0
+        assert measured == known
+    (tmp_path / "run" / "config.yaml").write_text("out: [")
+    with pytest.raises(UsageError, match=r"config.yaml"):
+        ts.read_run(tmp_path / "run")
 
 
 def test_where_geopandas_is_the_places_are_points_in_the_maps_crs(folder: Path) -> None:

@@ -23,7 +23,8 @@ from tilestream.errors import PlanError, UsageError
 from tilestream.formats.logs import ScanSelection, open_log
 from tilestream.formats.logs.poses import transform
 from tilestream.pipeline.engine.stage import BASE_BYTES
-from tilestream.pipeline.jobs.simulate import Size, plan_simulation, simulate
+from tilestream.pipeline.jobs.simulate import plan_simulation, simulate
+from tilestream.pipeline.jobs.simulation_record import Size
 from tilestream.pipeline.stages import simulated
 from tilestream.records import Scan
 from tilestream.settings import LogOptions, StartSettings

@@ -19,7 +19,13 @@ import numpy as np
 import pandas as pd
 from scipy.spatial import cKDTree
 
-from tilestream.errors import SourceNotFoundError, StoreNotFoundError, UsageError
+from tilestream.bounded_yaml import parse_yaml
+from tilestream.errors import (
+    SourceNotFoundError,
+    StoreNotFoundError,
+    UsageError,
+    foreign_errors,
+)
 from tilestream.factors.rows import PLACE_COLUMNS
 from tilestream.files import Files, place_of
 from tilestream.model.join import ON_PATH
@@ -27,6 +33,8 @@ from tilestream.model.training import ESTIMATES, MAIN, PREDICTION_COLUMNS
 from tilestream.notebook import axes_of, html_of
 from tilestream.pipeline.jobs.run_book import RECORD, told_before
 from tilestream.pipeline.jobs.run_folder import map_of, rows_of, table_paths
+from tilestream.pipeline.jobs.run_inputs import seen_otherwise
+from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.records import Float64
 from tilestream.report.colours import MISSING, palette, scale_of
 from tilestream.store import TileStore
@@ -56,7 +64,8 @@ def read_run(place: str | os.PathLike[str]) -> pd.DataFrame:
     estimates. What a job did not make has no column or is NaN.
 
     A measured scan counts at the nearest place within 5 m, and of several the nearest; a place has
-    one label, of one drive. One that is near no place has a row of its own, with the drive as
+    one label, of one drive; drives that were seen with another lidar than the vehicle's have none
+    here. One that is near no place has a row of its own, with the drive as
     `route_id`. All labels with the factors of exactly their places are in `ts.dataset`.
 
     Args:
@@ -70,6 +79,7 @@ def read_run(place: str | os.PathLike[str]) -> pd.DataFrame:
         SourceNotFoundError: no tables there.
         IncompleteError: a table that must be there is not: the job has not ended.
         DamagedError: a table is not what was written.
+        UsageError: `config.yaml` there is no job of this version.
 
     Examples:
         >>> table = ts.read_run("run")
@@ -124,14 +134,28 @@ def _places(place: str | os.PathLike[str]) -> pd.DataFrame:
 
 
 def _labels(place: str | os.PathLike[str]) -> pd.DataFrame:
-    """The measured places, with the drive of each."""
-    tables = []
+    """The measured places, with the drive of each; of a job none that was seen with another lidar
+    than that of its estimates.
+    """
+    tables, others = [], _otherwise(place)
     for path in table_paths(place, "errors"):
         group = path.rsplit("/", 2)[1]
+        if group in others:
+            continue
         rows = read_tables([path])
         tables.append(rows.assign(drive="" if group == "errors" else group))
     rows = pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
     return rows[rows["status"] == "done"].reset_index(drop=True) if len(rows) else rows
+
+
+def _otherwise(place: str | os.PathLike[str]) -> list[str]:
+    """The drives of a job that are observed with another lidar than the vehicle's."""
+    config = Files.at(place).under("config.yaml")
+    if not config.there():
+        return []
+    with foreign_errors(UsageError, f"{config.address}: no job", "give a run directory of ours"):
+        settings = RunSettings(**parse_yaml(config.read().decode("utf-8")))
+    return seen_otherwise(settings, settings.drives)
 
 
 def with_labels(places: pd.DataFrame, labels: pd.DataFrame) -> pd.DataFrame:

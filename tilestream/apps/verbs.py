@@ -16,6 +16,7 @@ from tilestream.pipeline.jobs import run as main_job
 from tilestream.pipeline.jobs import simulate as simulation
 from tilestream.pipeline.jobs.forecast import forecast
 from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
+from tilestream.pipeline.jobs.simulation_record import Size
 from tilestream.records import District
 from tilestream.simulation.settings import settings_in
 from tilestream.store import Condition, open_store
@@ -94,7 +95,7 @@ def simulate(
     scans_per_point: int = 1,
     every: int = 1,
     survey_of: str | os.PathLike[str] | None = None,
-    size: simulation.Size = "full",
+    size: Size = "full",
     client: Any | None = None,
     watch: Watch | None = None,
 ) -> Path:
@@ -156,7 +157,7 @@ def demo(
     client: Any | None = None,
     watch: Watch | None = None,
 ) -> Path | str:
-    """The main job on a few streets of Shinjuku, simulated first: needs minutes and no files.
+    """A street of Shinjuku from its map alone, and what a drive measures: minutes, no files.
 
     Arguments, result and errors as `ts.run`, with a run directory in place of settings.
     """

@@ -2,11 +2,11 @@
 
 import io
 import json
-from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import pandas as pd
 import typer
+from pydantic import Field, model_validator
 
 from tilestream.apps import verbs
 from tilestream.cli.cluster import ALL_CORES, HERE, AllCores, Cluster, on_cluster
@@ -15,6 +15,7 @@ from tilestream.cli.options import AsJson, Changes, Config, DryRun
 from tilestream.cli.printing import err, out, print_json, say, say_notes
 from tilestream.cli.progress import progress
 from tilestream.cli.tables import forecast_table, plan_table, report_table
+from tilestream.config import Settings
 from tilestream.errors import LimitError, PartialError
 from tilestream.files import Files
 from tilestream.pipeline.jobs import run as main_job
@@ -28,7 +29,7 @@ from tilestream.pipeline.stages.simulated import SCENE_BYTES
 from tilestream.records import District
 from tilestream.report import cards, gate
 from tilestream.report.drives import EVALUATED, DriveMeasured
-from tilestream.report.measured import MEASURES, check_measure
+from tilestream.report.measured import Measured
 from tilestream.report.segments import MISSING, Over, check_threshold
 from tilestream.settings import (
     LabelSettings,
@@ -47,44 +48,28 @@ def template() -> None:
     out.out(verbs.template(), end="", highlight=False)
 
 
-FailOver = Annotated[
-    float | None,
-    typer.Option(
-        help="Exit with 1 if any error, estimated or measured, is above this [m], if less than "
-        f"{EVALUATED:.0%} of a drive or of the places of a route were evaluated, or if more "
-        f"than {MISSING:.0%} of all places have no estimate."
-    ),
-]
+class GateSettings(Settings):
+    """What a gate asks for."""
+
+    fail_over: float | None = Field(
+        default=None,
+        description="Exit with 1 if any error, estimated or measured, is above this [m], if less "
+        f"than {EVALUATED:.0%} of a drive or of the places of a route were evaluated, or if more "
+        f"than {MISSING:.0%} of all places have no estimate.",
+    )
+    measure: Measured = "mean"
+    """Part of the error that --fail-over asks for; of p_fail it is a share."""
+    over: Over = "places"
+    """Of what --fail-over asks: single places, or means over 12 m."""
+
+    @model_validator(mode="after")
+    def _positive(self) -> Self:
+        if self.fail_over is not None:
+            check_threshold(self.fail_over)
+        return self
 
 
-Asked = Annotated[
-    str, typer.Option("--measure", help=f"Of --fail-over: {', '.join(MEASURES)} (p_fail: a share).")
-]
-PerWhat = Annotated[
-    Over, typer.Option("--over", help="Of --fail-over: single places, or means over 12 m.")
-]
-
-
-@dataclass(frozen=True)
-class Gate:
-    """What `--fail-over` asks for."""
-
-    limit: float | None
-    """Greatest error that passes; None: no gate."""
-    measure: str
-    """Part of the error."""
-    over: Over
-    """Places or segments."""
-
-    def check(self) -> None:
-        """Refuse what cannot be asked for, before the job.
-
-        Raises:
-            UsageError: no such measure, or a limit that is not positive.
-        """
-        check_measure(self.measure)
-        if self.limit is not None:
-            check_threshold(self.limit)
+GATE = fields("fail_over", "measure", "over")
 
 
 @on_cluster
@@ -108,6 +93,7 @@ def estimate(
     labels: Annotated[LabelSettings, fields("matcher")],
     which_map: Annotated[MapSettings, fields("crs", "partial", *LogSettings.model_fields)],
     report: Annotated[ReportSettings, fields("threshold", "title")],
+    gate_of: Annotated[GateSettings, GATE],
     route: Annotated[
         list[str],
         typer.Option(
@@ -124,9 +110,6 @@ def estimate(
         ),
     ] = None,
     folder: Annotated[str, typer.Option("--out", help="The run directory.")] = OUT,
-    fail_over: FailOver = None,
-    measure: Asked = "mean",
-    over: PerWhat = "places",
     dry_run: Annotated[bool, typer.Option("--dry-run", help="As `plan`.")] = False,
     as_json: AsJson = False,
     cluster: Cluster = ALL_CORES,
@@ -144,8 +127,6 @@ def estimate(
     It ends by printing what the estimates are worth, the headline, and where the report is. The
     same command continues a job that was stopped. `tilestream run` learns from drives too.
     """
-    gate_of = Gate(fail_over, measure, over)
-    gate_of.check()
     settings = estimate_settings(
         sources, route, folder, model, places, seeing, labels, which_map, report
     )
@@ -156,19 +137,16 @@ def estimate(
 
 
 @on_cluster
+@with_settings
 def run(
     config: Config,
+    gate_of: Annotated[GateSettings, GATE],
     changes: Changes = [],  # noqa: B006
-    fail_over: FailOver = None,
-    measure: Asked = "mean",
-    over: PerWhat = "places",
     dry_run: Annotated[bool, typer.Option("--dry-run", help="As `plan`.")] = False,
     as_json: AsJson = False,
     cluster: Cluster = ALL_CORES,
 ) -> None:
     """The main job: from map and drives to the estimated error everywhere, and its report."""
-    gate_of = Gate(fail_over, measure, over)
-    gate_of.check()
     settings = read_settings(config, changes)
     if dry_run:
         show_plan(settings, as_json)
@@ -176,7 +154,9 @@ def run(
         do_and_tell(settings, cluster, gate_of, as_json)
 
 
-def do_and_tell(settings: RunSettings, cluster: Cluster, gate_of: Gate, as_json: bool) -> None:
+def do_and_tell(
+    settings: RunSettings, cluster: Cluster, gate_of: GateSettings, as_json: bool
+) -> None:
     """Run the main job, print its headline, and close the gate where one is asked for.
 
     What failed is told after the headline of what is done.
@@ -198,8 +178,8 @@ def do_and_tell(settings: RunSettings, cluster: Cluster, gate_of: Gate, as_json:
         show_report(folder)
     if failed is not None:
         raise failed
-    if gate_of.limit is not None:
-        require_within(folder, gate_of.limit, gate_of.measure, gate_of.over)
+    if gate_of.fail_over is not None:
+        require_within(folder, gate_of.fail_over, gate_of.measure, gate_of.over)
 
 
 def do_job(settings: RunSettings, cluster: Cluster) -> Files:
@@ -259,7 +239,7 @@ def lost_labels(report: dict[str, Any]) -> list[str]:
 
 
 def require_within(
-    folder: Files, limit: float, measure: str = "mean", over: Over = "places"
+    folder: Files, limit: float, measure: Measured = "mean", over: Over = "places"
 ) -> None:
     """Fail where the error exceeds a limit, or is not known: a gate for a map release.
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import pandas as pd
@@ -19,7 +20,9 @@ MEASURES: Mapping[str, str] = {
     "p_fail": "p_fail",
     "tail": "error_tail",
 }
-"""What may be asked for (mean, p_fail, tail, along, across, up), with the label of each."""
+"""What may be asked for, with the label of each."""
+Measured = Literal["mean", "along", "across", "up", "p_fail", "tail"]
+"""One of `MEASURES`."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +44,8 @@ class Measure:
 
 
 def measured_column(measure: str) -> str:
-    """Name of the column of measured errors beside the estimates."""
-    return f"measured_{measure}"
+    """Name of the column of measured errors beside the estimates: `measured` of the mean."""
+    return "measured" if measure == "mean" else f"measured_{measure}"
 
 
 MEASURED_COLUMNS = tuple(
@@ -83,23 +86,14 @@ def with_measured(places: pd.DataFrame, labels: pd.DataFrame, reach: float) -> p
     return pd.concat([kept, found.rename(columns=named)], axis=1)
 
 
-def check_measure(name: str) -> None:
-    """Refuse a measure that there is not.
-
-    Raises:
-        UsageError: it is not of `MEASURES`.
-    """
-    if name not in MEASURES:
-        raise UsageError(f"no measure {name!r}: choose from {', '.join(MEASURES)}")
-
-
 def measure_of(places: pd.DataFrame, name: str = "mean") -> Measure:
     """A part of the error of all places, estimated and, where `with_measured` knows it, measured.
 
     Raises:
         UsageError: no such measure.
     """
-    check_measure(name)
+    if name not in MEASURES:
+        raise UsageError(f"no measure {name!r}: choose from {', '.join(MEASURES)}")
     column = measured_column(name)
     nothing = np.full(len(places), np.nan)
     return Measure(

@@ -119,7 +119,8 @@ class Worth:
             if known(self.spearman_low) and known(self.spearman_high):
                 said += f" ({self.spearman_low:.2f} to {self.spearman_high:.2f})"
         if known(self.level_low) and known(self.level_high):
-            said += f"; level {self.level_low:.2g} to {self.level_high:.2g} by lidar"
+            levels = f"{self.level_low:.2g} to {self.level_high:.2g}"
+            said += f"; by lidar estimates are {levels} times the errors"
         if self.coverage is not None:
             said += f"; {percent(self.coverage, 0)} of the measured errors lay in their interval"
         return f"{said}."

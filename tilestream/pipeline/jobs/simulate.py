@@ -1,23 +1,24 @@
 """Simulate a city: survey blocks and drive logs, in tasks per stretch of street."""
 
-import hashlib
-import json
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-import numpy as np
-import yaml
-
-from tilestream.bounded_yaml import read_yaml
 from tilestream.errors import PartialError, PlanError, UsageError
 from tilestream.files import Files, local_path, place_of
 from tilestream.lock import only_writer
 from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.engine.stage import Task
+from tilestream.pipeline.jobs.simulation_record import (
+    SMALL_POINTS,
+    Size,
+    begin_folder,
+    identity_of,
+    require_same,
+    require_surveyed,
+)
 from tilestream.pipeline.stages.simulated import (
     DriveLog,
     ScanParts,
@@ -28,27 +29,16 @@ from tilestream.pipeline.stages.simulated import (
     scanned,
     survey,
 )
-from tilestream.simulation.city import City, data_file, stretches
-from tilestream.simulation.drive import motion_of
+from tilestream.simulation.city import data_file, stretches
 from tilestream.simulation.settings import SimulationSettings
 from tilestream.simulation.streets import Street, check_clear, read_streets, street_called
-from tilestream.version import VERSION
 
 STRETCH = 50
 """Sample points of a stretch: a task's worth."""
-SMALL_POINTS, SMALL_RAYS = 40, 4_000
-"""Of `size="small"`: sample points of each path, rays per metre of the survey."""
+SMALL_RAYS = 4_000
+"""Rays per metre of the survey of `size="small"`."""
 BYTES_PER_RAY, BYTES_PER_SCAN = 4, 400_000
 """On disk, generously: of a survey, and of a scan while it waits for its log [bytes]."""
-RECORD, ROUTES = "simulation.yaml", "routes.geojson"
-"""Files that say what was simulated, and where its streets run."""
-OF_DRIVE = ("preset", "lidar", "odometry_error", "reverse", "side", "scans_per_point", "every")
-"""What of a simulation may differ from the one whose survey it uses."""
-SIMULATION_VERSION = 1
-"""Raised when the code of the simulation changes what it writes."""
-
-Size = Literal["full", "small"]
-"""How much of each path."""
 
 
 def simulate(
@@ -103,17 +93,17 @@ def simulate(
         size=size,
     )
     settings = _sized(settings, size)
-    identity = _identity(settings, scans_per_point, every, size)
-    _require_same(folder, identity)
+    identity = identity_of(settings, scans_per_point, every, size)
+    require_same(folder, identity)
     if survey_of is not None:
         surveyed = Path(place_of(local_path(survey_of)))
-        _require_surveyed(surveyed, identity, _surveys(settings, surveyed, paths, size))
+        require_surveyed(surveyed, identity, _surveys(settings, surveyed, paths, size))
     require_space(folder, _bytes_needed(plan))
     city = SimulatedCity(settings.model_dump_json()).read()
     for street in city.streets:
         check_clear(street, city.footprints)
     with only_writer(folder):
-        _begin(folder, city, identity)
+        begin_folder(folder, city, identity)
         outcomes = execute(plan, client, watch, shared=[str(folder)])
         failures = {outcome.key: outcome.reason for outcome in outcomes if not outcome.ok}
         for name in ("", "survey", f"logs/drive{settings.drive}"):
@@ -284,125 +274,3 @@ def _sized(settings: SimulationSettings, size: Size) -> SimulationSettings:
         return settings
     thin = settings.survey.model_copy(update={"rays_per_m": SMALL_RAYS})
     return settings.model_copy(update={"survey": thin})
-
-
-def _identity(
-    settings: SimulationSettings, scans_per_point: int, every: int, size: Size
-) -> dict[str, Any]:
-    """All that decides what the files of a simulation hold, whatever their drive."""
-    inputs = {
-        name: hashlib.sha256(data_file(name).read_bytes()).hexdigest()
-        for name in (settings.city.footprints, settings.city.routes)
-    }
-    return {
-        "settings": settings.model_dump(mode="json", exclude={"drive", "note"}),
-        "scans_per_point": scans_per_point,
-        "every": every,
-        "size": size,
-        "inputs_sha256": inputs,
-        "tilestream": VERSION,
-        "simulation_version": SIMULATION_VERSION,
-    }
-
-
-def _require_same(folder: Path, identity: dict[str, Any]) -> None:
-    """Refuse to mix two simulations.
-
-    Raises:
-        UsageError: the folder holds one with another identity; names what differs.
-    """
-    record = folder / RECORD
-    if not record.exists():
-        return
-    known = _record(record)
-    there = {name: known.get(name) for name in identity}
-    other = [f"{name} {there[name]}" for name in identity if there[name] != identity[name]]
-    if other:
-        raise UsageError(
-            f"{folder} holds another simulation, with {'; '.join(other)} ({record}): give another "
-            "directory"
-        )
-
-
-def _record(path: Path) -> dict[str, Any]:
-    """What was simulated beside it.
-
-    Raises:
-        UsageError: it is no record.
-    """
-    known = read_yaml(path, UsageError)
-    if not isinstance(known, dict) or not isinstance(known.get("settings"), dict):
-        raise UsageError(f"{path} is no record of a simulation: give another directory")
-    return known
-
-
-def _require_surveyed(folder: Path, identity: dict[str, Any], surveys: Sequence[Task]) -> None:
-    """Refuse a survey that is not of the same city, or not whole.
-
-    Raises:
-        UsageError: names what differs, or how much is missing.
-    """
-    record = folder / RECORD
-    if not record.exists():
-        raise UsageError(f"{folder}: no simulation is there: give one whose survey is to be used")
-    known = _record(record)
-    same = [name for name in identity if name not in ("settings", *OF_DRIVE)]
-    settings, there = identity["settings"], known["settings"]
-    other = [f"{name} {known.get(name)}" for name in same if known.get(name) != identity[name]]
-    other += [
-        f"{name} {there.get(name)}"
-        for name in settings
-        if name not in OF_DRIVE and there.get(name) != settings[name]
-    ]
-    if other:
-        raise UsageError(f"{folder} has the survey of another city, with {'; '.join(other)}")
-    missing = [task.key for task in surveys if task.writes.known(task.identity) is None]
-    if missing:
-        raise UsageError(
-            f"{folder}: {len(missing)} of {len(surveys)} blocks of its survey are not there, the "
-            f"first {missing[0]}: simulate it first, with these paths"
-        )
-
-
-def _begin(folder: Path, city: City, identity: dict[str, Any]) -> None:
-    """Make the folders; write what is simulated, and the routes."""
-    for part in ("survey", f"logs/drive{city.settings.drive}", "parts"):
-        (folder / part).mkdir(parents=True, exist_ok=True)
-    facts = identity | {
-        "note": city.settings.note,
-        "buildings": len(city.footprints.height),
-        "buildings_left_out": dict(city.footprints.refused),
-        "attribution": city.footprints.attribution,
-    }
-    end = SMALL_POINTS if identity["size"] == "small" else None
-    features = [_feature(street, city, end) for street in city.streets]
-    crs = city.settings.city.crs
-    named = {} if crs is None else {"crs": {"type": "name", "properties": {"name": crs}}}
-    routes = {"type": "FeatureCollection", **named, "features": features}
-    _keep(folder / ROUTES, f"{json.dumps(routes)}\n")
-    _keep(folder / RECORD, yaml.safe_dump(facts, sort_keys=True, allow_unicode=True))
-
-
-def _keep(path: Path, text: str) -> None:
-    """Write a file whole, unless it says so already: its time tells readers of a change."""
-    if not path.exists() or path.read_bytes() != text.encode():
-        Files.at(path).write(text.encode())
-
-
-def _feature(street: Street, city: City, end: int | None) -> dict[str, Any]:
-    """A street as GeoJSON, as far as it is simulated, with the height of its road."""
-    motion = replace(motion_of(street, city.settings, 0.0), side=0.0)
-    line = motion.pose(city.ground, street.arc[:end])[:, :3, 3] + city.settings.city.shift
-    properties = {
-        "name": street.name,
-        "kind": street.kind,
-        "driven": street.driven,
-        "spots": [vars(spot) for spot in street.spots],
-    }
-    geometry = {"type": "LineString", "coordinates": np.round(line, 3).tolist()}
-    return {
-        "type": "Feature",
-        "id": street.name,
-        "properties": properties,
-        "geometry": geometry,
-    }
