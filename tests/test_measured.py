@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from tilestream.errors import UsageError
 from tilestream.model.training import ESTIMATES
+from tilestream.report.gate import gate
 from tilestream.report.measured import MEASURES, measure_of, measured_column, with_measured
-from tilestream.report.segments import gate
 from tilestream.report.summary import headline
 
 

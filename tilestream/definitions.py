@@ -32,6 +32,7 @@ from tilestream.pipeline.stages.register import START_COLUMNS
 from tilestream.pipeline.stages.samples import COLUMNS as ALL_FACTORS
 from tilestream.pipeline.stages.samples import DATASET_COLUMNS, LOST_COLUMNS
 from tilestream.records import Column
+from tilestream.report.gate import GateSettings
 from tilestream.simulation.settings import SimulationSettings
 
 TABLES: dict[str, tuple[Column, ...]] = {
@@ -55,8 +56,12 @@ TABLES: dict[str, tuple[Column, ...]] = {
     "predictions": (*PLACE_COLUMNS, *PREDICTION_COLUMNS),
 }
 """The columns of each kind of table in a run directory."""
-FILES: dict[str, type[Settings]] = {"job": RunSettings, "simulation": SimulationSettings}
-"""The settings that a YAML file holds, by the kind of file."""
+GIVEN: dict[str, type[Settings]] = {
+    "the job file": RunSettings,
+    "the simulation file": SimulationSettings,
+    "options of estimate and run": GateSettings,
+}
+"""The settings, by where they are given."""
 
 Kind = Literal["column", "setting", "term", "section"]
 
@@ -259,10 +264,10 @@ def _column_entries() -> Iterator[Entry]:
 
 
 def _setting_entries() -> Iterator[Entry]:
-    fields = [(file, *field) for file, model in FILES.items() for field in _fields(model, ())]
+    fields = [(where, *field) for where, model in GIVEN.items() for field in _fields(model, ())]
     owners = Counter(name for _, name in {(owner, levels[-1]) for _, levels, owner, _ in fields})
     columns = {column.name for table in TABLES.values() for column in table}
-    for file, levels, owner, field in fields:
+    for where, levels, owner, field in fields:
         meaning = " ".join((field.description or "").split())
         unit = _UNIT.search(meaning)
         # A name that is also another's names this setting only with its levels.
@@ -271,7 +276,7 @@ def _setting_entries() -> Iterator[Entry]:
         yield Entry(
             ".".join(levels),
             "setting",
-            f"the {file} file, {owner.__name__} in Python",
+            f"{where}, {owner.__name__} in Python",
             meaning,
             unit=unit[1] if unit else "",
             default=_default(field),

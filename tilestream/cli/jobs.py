@@ -2,11 +2,10 @@
 
 import io
 import json
-from typing import Annotated, Any, Self
+from typing import Annotated, Any
 
 import pandas as pd
 import typer
-from pydantic import Field, model_validator
 
 from tilestream.apps import verbs
 from tilestream.cli.cluster import ALL_CORES, HERE, AllCores, Cluster, on_cluster
@@ -15,7 +14,6 @@ from tilestream.cli.options import AsJson, Changes, Config, DryRun
 from tilestream.cli.printing import err, out, print_json, say, say_notes
 from tilestream.cli.progress import progress
 from tilestream.cli.tables import forecast_table, plan_table, report_table
-from tilestream.config import Settings
 from tilestream.errors import LimitError, PartialError
 from tilestream.files import Files
 from tilestream.pipeline.jobs import run as main_job
@@ -29,8 +27,8 @@ from tilestream.pipeline.stages.simulated import SCENE_BYTES
 from tilestream.records import District
 from tilestream.report import cards, gate
 from tilestream.report.drives import EVALUATED, DriveMeasured
+from tilestream.report.gate import GateSettings, Over
 from tilestream.report.measured import Measured
-from tilestream.report.segments import MISSING, Over, check_threshold
 from tilestream.settings import (
     LabelSettings,
     LogSettings,
@@ -46,27 +44,6 @@ from tilestream.simulation.settings import SimulationSettings
 def template() -> None:
     """Print a job for your city: a YAML file that explains every setting."""
     out.out(verbs.template(), end="", highlight=False)
-
-
-class GateSettings(Settings):
-    """What a gate asks for."""
-
-    fail_over: float | None = Field(
-        default=None,
-        description="Exit with 1 if any error, estimated or measured, is above this [m], if less "
-        f"than {EVALUATED:.0%} of a drive or of the places of a route were evaluated, or if more "
-        f"than {MISSING:.0%} of all places have no estimate.",
-    )
-    measure: Measured = "mean"
-    """Part of the error that --fail-over asks for; of p_fail it is a share."""
-    over: Over = "places"
-    """Of what --fail-over asks: single places, or means over 12 m."""
-
-    @model_validator(mode="after")
-    def _positive(self) -> Self:
-        if self.fail_over is not None:
-            check_threshold(self.fail_over)
-        return self
 
 
 GATE = fields("fail_over", "measure", "over")

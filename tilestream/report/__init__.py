@@ -8,7 +8,7 @@ comparison (Comparison) ----------------------------------+                (temp
 """
 
 from tilestream.report.data import Findings
-from tilestream.report.segments import gate
+from tilestream.report.gate import gate
 from tilestream.report.summary import cards
 from tilestream.report.write import write_comparison, write_report
 

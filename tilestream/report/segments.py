@@ -1,17 +1,13 @@
 """What is read off the estimates: lengths, the share over a threshold, segments, worst places."""
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
 from tilestream.errors import UsageError
-from tilestream.model.figures import SEGMENT
 from tilestream.records import Float64, Int64
-from tilestream.report.drives import EVALUATED
 from tilestream.report.measured import measure_of
 
 WORST = 10
@@ -22,94 +18,6 @@ APART = 30.0
 """Least distance between two of them [m]: nearer ones are the same place twice."""
 BRIDGE = 5.0
 """Places over the threshold this near along a route are one segment, whatever lies between [m]."""
-MISSING = 0.05
-"""Share of the places that may be without an estimate where a gate opens."""
-Over = Literal["places", "segments"]
-"""What a gate asks of."""
-NAMED = 5
-"""Routes that are named where a gate stays closed."""
-
-
-def gate(
-    places: pd.DataFrame,
-    limit: float,
-    drives: Sequence[Mapping[str, Any]] = (),
-    measure: str = "mean",
-    over: Over = "places",
-) -> list[str]:
-    """Why a map does not pass a limit; empty: it passes.
-
-    A measured error counts as an estimate does. What is not known does not pass: a route without
-    any estimate fails the gate, and so does one of whose places less than `EVALUATED` have one, a
-    drive that was not evaluated to that share, and a map of which more than `MISSING` of the places
-    have no estimate.
-
-    Args:
-        places: route_id, arc_length [m] and the estimates of every sample point, with what was
-            measured there (`with_measured`).
-        limit: greatest error that passes [m]; of p_fail a share.
-        drives: how much of each drive was measured (`DriveMeasured.plain`).
-        measure: the part of the error that is asked for (`MEASURES`).
-        over: `segments`: means over `SEGMENT` of a route instead of single places.
-
-    Raises:
-        UsageError: the limit is not positive, or no such measure.
-    """
-    check_threshold(limit)
-    one = measure_of(places, measure)
-    estimate, known_error = one.estimate, one.known
-    found, total = [], len(places)
-    judged = places[["route_id", "arc_length"]].assign(
-        error=known_error, measured=known_error == one.measured
-    )
-    judged = _windows(judged) if over == "segments" else judged
-    above = judged[judged["error"] > limit]
-    if len(above):
-        worst = above.iloc[int(np.argmax(above["error"]))]
-        unit = "" if measure == "p_fail" else " m"
-        what = "sample points" if over == "places" else f"segments of {SEGMENT:g} m"
-        found.append(
-            f"{measure}: {len(above)} of {len(judged)} {what} are above {limit:g}{unit}, the worst "
-            f"{worst['error']:.2f}{unit} on {worst['route_id']} at {worst['arc_length']:.0f} m, "
-            f"{'measured' if worst['measured'] else 'estimated'}"
-        )
-    known = pd.Series(np.isfinite(estimate)).groupby(places["route_id"].to_numpy(str)).mean()
-    blind = known.index[known == 0.0].tolist()
-    if blind:
-        found.append(f"no estimate at all on {_named(blind)}")
-    hardly = known[(known > 0.0) & (known < EVALUATED)]
-    if len(hardly):
-        told = [f"{route} ({share:.0%})" for route, share in hardly.items()]
-        found.append(f"less than {EVALUATED:.0%} of the places have an estimate on {_named(told)}")
-    unseen = [
-        f"{one['drive']} ({one['measured']:,} of {one['scans']:,} scans)"
-        for one in drives
-        if not one["evaluated"]
-    ]
-    if unseen:
-        found.append(f"less than {EVALUATED:.0%} was measured of drive {_named(unseen)}")
-    missing = int(np.isnan(estimate).sum())
-    if missing > MISSING * total:
-        found.append(
-            f"{missing} of {total} sample points have no estimate, more than {MISSING:.0%}; "
-            "report/index.html lists why"
-        )
-    return found
-
-
-def _windows(judged: pd.DataFrame) -> pd.DataFrame:
-    """Means of `error` over each `SEGMENT` of a route, of the places that have one; `measured`
-    where any of them is.
-    """
-    there = judged[judged["error"].notna()]
-    number = (there["arc_length"] // SEGMENT).rename("number")
-    parts = there.groupby(["route_id", number])
-    how = {"error": "mean", "arc_length": "min", "measured": "any"}
-    return parts.agg(how).reset_index()
-
-
-def _named(names: Sequence[str]) -> str:
-    return ", ".join(names[:NAMED]) + (", …" if len(names) > NAMED else "")
 
 
 def check_threshold(limit: float) -> None:
