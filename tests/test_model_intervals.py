@@ -3,12 +3,19 @@
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import stats
 
-from tilestream.model.intervals import SHARES, calibrate, coverage, wider_for_few, with_intervals
+from tilestream.model.intervals import (
+    SHARES,
+    calibrate,
+    coverage,
+    interval_score,
+    wider_for_few,
+    with_intervals,
+)
 
 Floats = NDArray[np.float64]
 
@@ -125,6 +132,7 @@ def test_a_higher_level_reaches_farther(
 
 
 @settings(max_examples=60, deadline=None)
+@example([[0], [0], [-5, 36], [0, 0, 0, 0, 0, -17, 33]], 0.9).via("two equally hard blocks")
 @given(
     st.lists(st.lists(st.integers(-20, 40), min_size=1, max_size=7), min_size=2, max_size=6),
     st.sampled_from([0.5, 0.8, 0.9]),
@@ -151,7 +159,8 @@ def test_the_hardest_block_counts_twice(errors: list[list[int]], level: float) -
     if up == 0.0:
         return
     scores = [[max(x / up, -x / down) for x in block] for block in errors]
-    hardest = max(range(len(scores)), key=lambda k: (np.quantile(scores[k], level), -k))
+    hard = [round(float(np.quantile(one, level)), 9) for one in scores]
+    hardest = hard.index(max(hard))
     size = quantile(scores, level, hardest)
     size *= stats.t.ppf(0.5 + level / 2.0, len(errors) ** 2) / stats.norm.ppf(0.5 + level / 2.0)
     actual = 1.0 + 0.01 * np.concatenate(errors)
@@ -219,3 +228,30 @@ def test_the_error_of_a_coverage_is_that_of_whole_blocks() -> None:
     assert found.loc["", "error"] == pytest.approx(inside.std() / np.sqrt(blocks), 0.1)
     more = coverage(pd.concat([many, one_block]), level=0.3).set_index("path")
     assert np.isnan(more.loc["d", "error"])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_large_errors_are_held_as_small_ones_are(seed: int) -> None:
+    """Of a good lidar and a few places of a poor one, whose errors grow with the estimate."""
+    rng = np.random.default_rng(seed)
+    blocks, of_each = 12, 100
+    estimate = np.where(rng.random(blocks * of_each) < 0.05, 0.4, 0.05)
+    actual = np.abs(estimate * (1.0 + 0.3 * rng.standard_normal(len(estimate))))
+    names = np.repeat([f"b{k}" for k in range(blocks)], of_each)
+    low, high = calibrate(actual, estimate, names).around(estimate)
+    held = (low <= actual) & (actual <= high)
+    assert held[estimate == 0.4].mean() == pytest.approx(0.9, abs=0.1)
+    assert held[estimate == 0.05].mean() == pytest.approx(0.9, abs=0.05)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.floats(0.05, 0.95), st.floats(-2.0, 2.0), st.floats(-2.0, 2.0))
+def test_no_ends_score_less_than_the_quantiles(level: float, down: float, up: float) -> None:
+    actual = stats.norm.ppf((np.arange(2000) + 0.5) / 2000)
+    low, high = stats.norm.ppf([0.5 - level / 2.0, 0.5 + level / 2.0])
+
+    def score(low: float, high: float) -> float:
+        return float(interval_score(actual, np.full(2000, low), np.full(2000, high), level).mean())
+
+    other = sorted((low + down, high + up))
+    assert score(low, high) <= score(*other) + 1e-3
