@@ -35,7 +35,7 @@ from tilestream.model.features import SPREAD_ACROSS, SPREAD_ALONG, WEAK_ALONG
 from tilestream.records import Float64
 from tilestream.report import Findings, gate, write_report
 from tilestream.report.charts import MOST, city_map
-from tilestream.report.colours import MISSING, STEPS, palette, scale_of
+from tilestream.report.colours import FIXED, MISSING, THRESHOLDS, scale_of
 from tilestream.report.exports import write_csv, write_geoparquet
 from tilestream.report.lines import with_gaps
 from tilestream.report.segments import BRIDGE, reaches, segments, worst_places
@@ -235,20 +235,39 @@ def test_the_cloud_and_its_colours_are_read_by_open3d(found: Findings, folder: P
         cloud.point["estimate"].numpy()[:, 0], estimate.astype(np.float32), rtol=1e-6
     )
     colours = np.asarray(cloud.point["colors"].numpy())
-    np.testing.assert_array_equal(colours, scale_of(estimate).rgb(estimate))
+    np.testing.assert_array_equal(colours, FIXED.rgb(estimate))
     grey = [int(MISSING[k : k + 2], 16) for k in (1, 3, 5)]
     assert (colours[np.isnan(estimate)] == grey).all()
     assert tuple(colours[np.nanargmax(estimate)]) == tuple(
-        int(palette()[-1][k : k + 2], 16) for k in (1, 3, 5)
+        int(FIXED.shades(estimate)[np.nanargmax(estimate)][k : k + 2], 16) for k in (1, 3, 5)
     )
 
 
 def test_colours_rise_in_lightness() -> None:
-    rgb = np.array([[int(c[k : k + 2], 16) for k in (1, 3, 5)] for c in palette()])
+    rgb = np.array([[int(c[k : k + 2], 16) for k in (1, 3, 5)] for c in FIXED.colours])
     lightness = (rgb / 255.0) ** 2.2 @ np.array([0.2126, 0.7152, 0.0722])
-    assert len(palette()) == STEPS
-    assert (np.diff(lightness) > -1e-3).all()
+    assert (lightness[1:] > 1.1 * lightness[:-1]).all()
     assert lightness[-1] > 4.0 * lightness[0]
+
+
+def test_colours_change_at_the_thresholds_that_people_ask_for() -> None:
+    at = np.array(THRESHOLDS)
+    assert FIXED.step(at).tolist() == [0, 1, 2, 3, 4, 5]  # an error of a threshold keeps it
+    assert FIXED.step(np.nextafter(at, 1.0)).tolist() == [1, 2, 3, 4, 5, 6]
+    assert FIXED.step(np.array([0.0, 9.0, np.nan])).tolist() == [0, 6, -1]
+    assert FIXED.shades(np.array([9.0, np.nan])) == [FIXED.colours[-1], MISSING]
+
+
+@given(st.lists(st.floats(0.0, 10.0), min_size=1, max_size=30), st.floats(0.0, 5.0))
+def test_a_range_of_its_own_ends_within_the_errors(errors: list[float], more: float) -> None:
+    known = np.array([*errors, max(errors) + more])
+    scale = scale_of(known)
+    assert list(scale.edges) == sorted(set(scale.edges))
+    assert 2 <= len(scale.edges) < 12
+    spread = np.quantile(known, 0.98) - known.min()
+    if spread > 1e-6:
+        assert known.min() <= scale.edges[0] < scale.edges[-1] <= known.min() + spread
+        assert scale.step(known[:1] * 0.0 + known.min())[0] == 0
 
 
 @st.composite

@@ -19,7 +19,7 @@ from tilestream.apps import runs
 from tilestream.apps.runs import with_labels
 from tilestream.errors import IncompleteError, SourceNotFoundError, UsageError
 from tilestream.model.join import ON_PATH
-from tilestream.report.colours import palette
+from tilestream.report.colours import FIXED
 
 
 @pytest.fixture(scope="module")
@@ -135,9 +135,11 @@ def test_a_street_is_coloured_by_error(folder: Path) -> None:
     assert large.get_offsets()[:, 0].tolist() == [5.0, 8.0]
     assert neither.get_offsets()[:, 0].tolist() == [9.0]
     colours = [mpl.colors.to_hex(one) for one in small.get_facecolors()]
-    assert colours[0] == palette()[0]
-    assert mpl.colors.to_hex(large.get_facecolors()[-1]) == palette()[-1]
-    assert ax.figure.axes[1].get_ylabel() == "localization error [m]"
+    table = ts.read_run(folder).set_index("x")
+    assert colours == FIXED.shades(np.sort(table.loc[4.0:8.0, "estimate"].to_numpy()))
+    measured = np.sort(table["measured"].dropna().to_numpy())
+    assert [mpl.colors.to_hex(c) for c in large.get_facecolors()] == FIXED.shades(measured)
+    assert ax.figure.axes[1].get_ylabel() == "localization error [cm]"
 
 
 def test_a_factor_may_colour_it(folder: Path) -> None:

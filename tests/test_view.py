@@ -32,7 +32,7 @@ from tilestream.model.training import PREDICTION_COLUMNS
 from tilestream.pipeline.jobs.run_folder import map_of
 from tilestream.pipeline.stages.label import ERROR_COLUMNS
 from tilestream.records import Column
-from tilestream.report.colours import scale_of
+from tilestream.report.colours import FIXED
 from tilestream.store import POINTS, Tile
 from tilestream.tables import write_table
 
@@ -109,7 +109,7 @@ def test_places_have_their_measured_error_else_the_estimate_else_none(run_dir: P
     assert [found[at] for at in (5.0, 10.0, 15.0)] == [(error, True) for error in MEASURED]
     assert [found[at] for at in (20.0, 25.0)] == [(0.05, False), (0.40, False)]
     assert all(np.isnan(found[at][0]) and not found[at][1] for at in (30.0, 35.0))
-    np.testing.assert_array_equal(shown.place_rgb(), scale_of(shown.error).rgb(shown.error) / 255.0)
+    np.testing.assert_array_equal(shown.place_rgb(), FIXED.rgb(shown.error) / 255.0)
     assert np.ptp(shown.place_rgb()[np.isnan(shown.error)], axis=1).max() == 0.0  # grey
     assert (np.ptp(shown.place_rgb()[~np.isnan(shown.error)], axis=1) > 0.3).all()
 

@@ -309,6 +309,9 @@ class ReportSettings(Settings):
     """Estimates above this are listed as segments [m]."""
     title: str | None = None
     """Its title; not given: the name of the run directory."""
+    own_range: bool = False
+    """Colours of the run's own range of errors, instead of steps at 5, 10, 15, 20, 25 and 50 cm as
+    in every report."""
 
 
 class PlaceSettings(Settings):

@@ -36,7 +36,8 @@ from tilestream.pipeline.jobs.run_folder import map_of, rows_of, table_paths
 from tilestream.pipeline.jobs.run_inputs import seen_otherwise
 from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.records import Float64
-from tilestream.report.colours import MISSING, palette, scale_of
+from tilestream.report.colours import FIXED, MISSING, scale_of
+from tilestream.report.formatting import CM_PER_M
 from tilestream.store import TileStore
 from tilestream.tables import read_tables
 
@@ -236,19 +237,19 @@ class Run:
             raise UsageError(f"{self.place}: {column!r} is no column of numbers: see `.table`")
         small = _numbers(table, column or "estimate")
         large = _numbers(table, "measured" if column is None else "")
-        scale = scale_of(np.where(np.isnan(large), small, large))
-        ax, colours = axes_of(ax), np.array([*palette(), MISSING])
+        scale = FIXED if column is None else scale_of(small)
+        ax = axes_of(ax)
         for values, size in ((small, 8.0), (large, 30.0)):
             rows = np.flatnonzero(~np.isnan(values))
             rows = rows[np.argsort(values[rows], kind="stable")]  # the worst on top
-            shade = colours[scale.step(values[rows])]
-            ax.scatter(table["x"].iloc[rows], table["y"].iloc[rows], s=size, c=shade.tolist(), lw=0)
+            shades = scale.shades(values[rows])
+            ax.scatter(table["x"].iloc[rows], table["y"].iloc[rows], s=size, c=shades, lw=0)
         neither = table[np.isnan(small) & np.isnan(large)]
         ax.scatter(neither["x"], neither["y"], s=12.0, c=MISSING, marker="x", lw=1.0)
-        shades = import_module("matplotlib.colors").ListedColormap(palette())
-        ramp = import_module("matplotlib.cm").ScalarMappable(cmap=shades)
-        ramp.set_clim(scale.low, scale.high)
-        ax.figure.colorbar(ramp, ax=ax, label=column or "localization error [m]")
+        per_metre, label = (
+            (CM_PER_M, "localization error [cm]") if column is None else (1.0, column)
+        )
+        ax.figure.colorbar(scale.mappable(per_metre), ax=ax, label=label)
         return ax
 
     def _repr_html_(self) -> str:

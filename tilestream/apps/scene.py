@@ -20,7 +20,7 @@ from tilestream.errors import TileNotReadyError, UsageError
 from tilestream.grid import MM_PER_M, Box, TileKey
 from tilestream.pipeline.jobs.run_folder import map_of, rows_of
 from tilestream.records import Float64
-from tilestream.report.colours import Scale, scale_of
+from tilestream.report.colours import FIXED
 from tilestream.store import TileStore
 
 MOST_POINTS = 2_000_000
@@ -67,14 +67,12 @@ class Scene:
         rgb: Float64 = LOWEST + np.clip(share, 0.0, 1.0)[:, None] * (HIGHEST - LOWEST)
         return rgb
 
-    @cached_property
-    def scale(self) -> Scale:
-        """The report's scale, of the errors that are shown."""
-        return scale_of(self.error)
-
     def place_rgb(self) -> Float64:
-        """(k, 3) colours of the places by error, grey where none is known, in [0, 1]."""
-        return self.scale.rgb(self.error) / 255.0
+        """(k, 3) colours of the places by error as in reports, grey where none is known, in
+        [0, 1].
+        """
+        rgb: Float64 = FIXED.rgb(self.error) / 255.0
+        return rgb
 
     @cached_property
     def seen(self) -> Float64:

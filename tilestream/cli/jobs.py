@@ -69,7 +69,7 @@ def estimate(
     seeing: Annotated[VirtualSettings, fields("range_max", "blind_rear_deg")],
     labels: Annotated[LabelSettings, fields("matcher")],
     which_map: Annotated[MapSettings, fields("crs", "partial", *LogSettings.model_fields)],
-    report: Annotated[ReportSettings, fields("threshold", "title")],
+    report: Annotated[ReportSettings, fields("threshold", "title", "own_range")],
     gate_of: Annotated[GateSettings, GATE],
     route: Annotated[
         list[str],

@@ -13,10 +13,8 @@ from tilestream.cli.printing import out, say_notes
 from tilestream.grid import TileKey
 from tilestream.pipeline.jobs.run_folder import map_of
 from tilestream.pipeline.jobs.sources import map_notes
-from tilestream.report.colours import STEPS, palette
-
-RAMP = 24
-"""Characters of the legend's ramp of colours."""
+from tilestream.report.colours import FIXED
+from tilestream.report.formatting import CM_PER_M
 
 
 def view(
@@ -55,8 +53,9 @@ def legend(scene: Scene) -> list[Text]:
         told = f"route: {measured:,} places measured (large), {known - measured:,} estimated "
         lines.append(Text(told + f"(small), {len(scene.places) - known:,} neither (grey)"))
     if known:
-        colours = palette()[:: STEPS // RAMP]
-        ramp = [("█", colour) for colour in colours]
-        ends = (f"{end * 100.0:.1f} cm" for end in (scene.scale.low, scene.scale.high))
-        lines.append(Text.assemble(f"error: {next(ends)} ", *ramp, f" {next(ends)} and more"))
+        edges = [f" {edge * CM_PER_M:g} " for edge in FIXED.edges] + [""]
+        line = Text("error [cm]: ")
+        for colour, edge in zip(FIXED.colours, edges, strict=True):
+            line.append("██", colour).append(edge)
+        lines.append(line)
     return lines

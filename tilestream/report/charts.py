@@ -10,6 +10,7 @@ from bokeh.embed import json_item
 from bokeh.models import (
     ColumnDataSource,
     DataRange1d,
+    FixedTicker,
     HoverTool,
     LinearColorMapper,
     NumeralTickFormatter,
@@ -26,8 +27,7 @@ from tilestream.report.colours import (
     CHOICES,
     HELD_OUT,
     MISSING,
-    palette,
-    scale_of,
+    Scale,
 )
 from tilestream.report.comparison import Comparison
 from tilestream.report.data import Findings, estimates, like_training
@@ -79,14 +79,11 @@ def city_map(found: Findings, tip: str) -> dict[str, Any]:
     """
     places = found.places
     estimate = estimates(places)
-    scale, colours = scale_of(estimate), palette()
     plot = _new_plot(600, "x", "y", MAP_TOOLS, match_aspect=True)
     drawn = worst_of_every(map_shows_every(found), places["route_id"], estimate)
     origin = _origin(places)
     kinds = _kinds(places)
-    mapper = LinearColorMapper(
-        palette=colours, low=scale.low * CM_PER_M, high=scale.high * CM_PER_M
-    )
+    mapper = LinearColorMapper(palette=found.scale.colours, low=0, high=len(found.scale.colours))
     for kind, marker, name in (
         ("in_domain", "circle", "like the training places"),
         ("outside", "diamond", "unlike the training places"),
@@ -97,11 +94,11 @@ def city_map(found: Findings, tip: str) -> dict[str, Any]:
         if not rows.size:
             continue
         rows = rows[np.argsort(estimate[rows], kind="stable")]
-        source = ColumnDataSource(_columns(places, rows, origin, found.digits), name=kind)
+        source = ColumnDataSource(_columns(found, rows, origin), name=kind)
         style: dict[str, Any] = (
             {"color": MISSING, "size": 7, "line_width": 1.5}
             if kind == "missing"
-            else {"color": {"field": "estimate", "transform": mapper}, "size": "size"}
+            else {"color": {"field": "step", "transform": mapper}, "size": "size"}
         )
         glyphs = plot.scatter("x", "y", source=source, marker=marker, legend_label=name, **style)
         # of the dots under the mouse the worst, which is the one on top
@@ -109,15 +106,28 @@ def city_map(found: Findings, tip: str) -> dict[str, Any]:
     _draw_measured(plot, found, origin, (tip, mapper))
     _number_the_worst(plot, places, origin)
     if np.isfinite(estimate).any():
-        bar = ColorBar(color_mapper=mapper, title="estimated error [cm]", width=12, padding=4)
-        bar.background_fill_alpha = 0.0
-        plot.add_layout(bar, "right")
+        plot.add_layout(_colour_bar(found.scale, mapper), "right")
     plot.xaxis.axis_label, plot.yaxis.axis_label = (
         f"{axis} − {value:.0f} m" if value else f"{axis} [m]"
         for axis, value in zip("xy", origin, strict=True)
     )
     _finish(plot)
     return _item(plot, "city-map")
+
+
+def _colour_bar(scale: Scale, mapper: LinearColorMapper) -> ColorBar:
+    """Equally high steps, with the error between two of them."""
+    return ColorBar(
+        color_mapper=mapper,
+        title="error [cm]",
+        width=12,
+        padding=4,
+        ticker=FixedTicker(ticks=list(range(1, len(scale.colours)))),
+        major_label_overrides={
+            k: f"{edge * CM_PER_M:.3g}" for k, edge in enumerate(scale.edges, start=1)
+        },
+        background_fill_alpha=0.0,
+    )
 
 
 def map_shows_every(found: Findings) -> int:
@@ -139,17 +149,17 @@ def _origin(places: pd.DataFrame) -> Float64:
     return np.where(np.abs(corner) >= 10_000.0, corner, 0.0)
 
 
-def _columns(
-    places: pd.DataFrame, rows: Int64, origin: Float64, digits: int | None
-) -> dict[str, Any]:
-    part = places.iloc[rows]
+def _columns(found: Findings, rows: Int64, origin: Float64) -> dict[str, Any]:
+    part, digits = found.places.iloc[rows], found.digits
     estimate = estimates(part)
-    share = np.clip(scale_of(estimates(places)).step(estimate), 0, None) / 255.0
+    step = found.scale.step(estimate)
+    share = np.clip(step, 0, None) / (len(found.scale.colours) - 1)
     figures = part[["low", "high", "p_fail", *AXES, *STARTS]].to_dict("records")
     return {
         "x": part["x"].to_numpy(np.float64) - origin[0],
         "y": part["y"].to_numpy(np.float64) - origin[1],
         "estimate": estimate * CM_PER_M,
+        "step": step + 0.5,
         "size": 5.0 + 7.0 * share,
         "route": part["route_id"].astype(str).tolist(),
         "arc": part["arc_length"].to_numpy(np.float64),
@@ -176,10 +186,11 @@ def _draw_measured(plot: figure, found: Findings, origin: Float64, how: tuple[st
     every = points_per_mark(len(rows), MOST)
     route = found.places["route_id"].to_numpy()[rows]
     rows = rows[worst_of_every(every, route, measured[rows])]
-    columns = _columns(found.places, rows, origin, found.digits)
+    columns = _columns(found, rows, origin)
     columns["measured"] = measured[rows] * CM_PER_M
+    columns["step"] = found.scale.step(measured[rows]) + 0.5
     source = ColumnDataSource(columns, name="measured")
-    style: dict[str, Any] = {"fill_color": {"field": "measured", "transform": mapper}}
+    style: dict[str, Any] = {"fill_color": {"field": "step", "transform": mapper}}
     style |= {"marker": "square", "size": 9, "line_color": "black", "legend_label": "measured"}
     glyphs = plot.scatter("x", "y", source=source, **style)
     plot.add_tools(_hover(glyphs, tip, sort_by=[("measured", -1)]))

@@ -1,14 +1,22 @@
 """Colours of a report: told apart in grey and by the colour-blind, on light and on dark."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from tilestream.records import Float64
 
-STEPS = 256
+THRESHOLDS = (0.05, 0.10, 0.15, 0.20, 0.25, 0.50)
+"""Errors at which the colour changes [m]: what people ask of a localizer, the same in every report,
+so that two of them can be compared."""
+STEPS = 7
+"""Colours of a run's own range, about."""
 MISSING = "#9a9a9a"
 """Places without an estimate."""
 ACTUAL, AGAIN, HELD_OUT = "#0072b2", "#56b4e9", "#d55e00"
@@ -19,13 +27,8 @@ OTHER = "#7f7f7f"
 CHOICES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", OTHER)
 """Of the choices that are compared, in turn."""
 CLIP = 0.98
-"""Quantile of the estimates at which the colours end: a few lost places must not hide the rest."""
-
-
-def palette() -> list[str]:
-    """Low to high: plasma without its ends, which vanish on a dark and on a light page."""
-    ramp = mpl.colormaps["plasma"](np.linspace(0.1, 0.86, STEPS))
-    return [mpl.colors.to_hex(colour) for colour in ramp]
+"""Quantile of the estimates at which the colours of a run's own range end: a few lost places must
+not hide the rest."""
 
 
 def to_rgb(colours: list[str]) -> Float64:
@@ -35,29 +38,50 @@ def to_rgb(colours: list[str]) -> Float64:
 
 @dataclass(frozen=True)
 class Scale:
-    """From an estimate to a colour."""
+    """From an error to one of a few colours."""
 
-    low: float
-    """Estimates up to this have the first colour [m]."""
-    high: float
-    """Estimates from this on have the last [m]."""
+    edges: tuple[float, ...]
+    """Where the colour changes, at least two, ascending [m]: an error of an edge has the lower
+    one."""
 
-    def step(self, estimate: Float64) -> NDArray[np.int64]:
-        """(n,) index into the palette; -1 where there is no estimate."""
-        share = (estimate - self.low) / (self.high - self.low)
-        known = np.isfinite(estimate)
-        step = np.clip(np.floor(np.where(known, share, 0.0) * STEPS), 0, STEPS - 1)
-        return np.where(known, step, -1).astype(np.int64)
+    @cached_property
+    def colours(self) -> list[str]:
+        """Low to high, one more than edges: plasma without its ends, which vanish on a dark and on
+        a light page.
+        """
+        ramp = mpl.colormaps["plasma"](np.linspace(0.1, 0.86, len(self.edges) + 1))
+        return [mpl.colors.to_hex(colour) for colour in ramp]
 
-    def rgb(self, estimate: Float64) -> NDArray[np.uint8]:
-        """(n, 3) colours of estimates, grey where there is none."""
-        return (255.0 * to_rgb([*palette(), MISSING])[self.step(estimate)]).round().astype(np.uint8)
+    def step(self, error: Float64) -> NDArray[np.int64]:
+        """(n,) index into the colours; -1 where there is no error."""
+        step = np.searchsorted(self.edges, error, side="left")
+        return np.where(np.isfinite(error), step, -1).astype(np.int64)
+
+    def shades(self, error: Float64) -> list[str]:
+        """(n,) colours of errors, grey where there is none."""
+        colours = [*self.colours, MISSING]
+        return [colours[step] for step in self.step(error)]
+
+    def rgb(self, error: Float64) -> NDArray[np.uint8]:
+        """(n, 3) the same as red, green and blue."""
+        levels = to_rgb([*self.colours, MISSING])
+        return (255.0 * levels[self.step(error)]).round().astype(np.uint8)
+
+    def mappable(self, per_metre: float = 1.0) -> ScalarMappable:
+        """For a colour bar of matplotlib, in units of which so many are a metre."""
+        edges = [edge * per_metre for edge in self.edges]
+        norm = BoundaryNorm(edges, len(self.colours), extend="both")
+        return ScalarMappable(norm, ListedColormap(self.colours))
 
 
-def scale_of(estimate: Float64) -> Scale:
-    """The scale of some estimates: from their least to their 98 % quantile."""
-    known = estimate[np.isfinite(estimate)]
-    if not known.size:
-        return Scale(0.0, 1.0)
-    low, high = float(known.min()), float(np.quantile(known, CLIP))
-    return Scale(low, high if high > low else low + 0.01)
+FIXED = Scale(THRESHOLDS)
+"""The scale of all reports."""
+
+
+def scale_of(error: Float64) -> Scale:
+    """A scale of some errors' own range: round edges from their least to their 98 % quantile."""
+    known = error[np.isfinite(error)]
+    low, high = (float(known.min()), float(np.quantile(known, CLIP))) if known.size else (0.0, 1.0)
+    high = high if high > low else low + 0.01
+    edges = tuple(float(edge) for edge in MaxNLocator(STEPS).tick_values(low, high)[1:-1])
+    return Scale(edges if len(edges) > 1 else (low, high))

@@ -13,6 +13,7 @@ from tilestream.model.registry import DEFAULT
 from tilestream.model.training import PREDICTION_COLUMNS
 from tilestream.notes import Notes
 from tilestream.records import Float64
+from tilestream.report.colours import FIXED, Scale, scale_of
 from tilestream.report.drives import DriveMeasured
 from tilestream.report.worth import Worth
 
@@ -81,6 +82,8 @@ class Findings:
     """The labels that no model can learn from: `reason`, `count`, `detail`, `kept_by`."""
     worth: Worth | None = None
     """What the estimates are worth; None: nobody has said it."""
+    own_range: bool = False
+    """Colours of the estimates' own range instead of those that all reports have."""
     cell_size: float | None = None
     """Edge of the cells that labels were measured with [m]; None: not known."""
     crs: str | None = None
@@ -90,6 +93,11 @@ class Findings:
     pictures."""
     around: Around | None = None
     """The map round a place, for the pictures of the worst ones; None: no pictures."""
+
+    @property
+    def scale(self) -> Scale:
+        """From an error to its colour on maps."""
+        return scale_of(estimates(self.places)) if self.own_range else FIXED
 
     @property
     def digits(self) -> int | None:

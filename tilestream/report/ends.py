@@ -6,14 +6,13 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.collections import PatchCollection
-from matplotlib.colors import ListedColormap, Normalize, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
 from tilestream.kernels.fixed_order import norms
 from tilestream.label import FAILED
 from tilestream.records import Float64
-from tilestream.report.colours import ACTUAL, palette
+from tilestream.report.colours import ACTUAL, FIXED, to_rgb
 from tilestream.report.formatting import CM_PER_M
 
 IN_A_ROW = 3
@@ -22,7 +21,6 @@ FARTHEST = 3.0
 """How far from the true position an end is drawn at most [m]; those beyond are counted."""
 NEAREST = 0.6
 """How far a picture of ends reaches at least [m]: the circle of failure is in it."""
-COLOURS = ListedColormap(palette())
 LOST = "#111111"
 """Starts that fail, and where they end."""
 REPEATED = 1e-6
@@ -58,21 +56,16 @@ def ends_figure(places: Sequence[tuple[str, pd.DataFrame]]) -> Figure:
         if column == 0:
             above.set_ylabel("starts, across [m]", fontsize=8)
             below.set_ylabel("ends, across [m]", fontsize=8)
-    _colour_bar(panels[0, -1])
+    _colour_bar(figure, panels[0, -1])
     return figure
 
 
-def _colour_bar(axes: Axes) -> None:
+def _colour_bar(figure: Figure, axes: Axes) -> None:
     """What the colours mean, right of a panel."""
-    bar = axes.inset_axes((1.06, 0.0, 0.06, 1.0))
-    ramp = np.linspace(0.0, 1.0, COLOURS.N)[:, None]
-    bar.imshow(ramp, origin="lower", aspect="auto", cmap=COLOURS,
-               extent=(0.0, 1.0, 0.0, FAILED * CM_PER_M))  # fmt: skip
-    bar.set(xticks=[])
-    bar.set_ylabel("error at the end [cm], black: failed", fontsize=8)
-    bar.yaxis.set_label_position("right")
-    bar.yaxis.tick_right()
-    bar.tick_params(labelsize=7)
+    beside = axes.inset_axes((1.06, 0.0, 0.06, 1.0))
+    bar = figure.colorbar(FIXED.mappable(CM_PER_M), cax=beside)
+    bar.set_label("error at the end [cm], black: failed", fontsize=8)
+    bar.ax.tick_params(labelsize=7)
 
 
 def _draw_starts(axes: Axes, rows: pd.DataFrame) -> None:
@@ -134,7 +127,7 @@ def _lattice(at: Float64) -> tuple[float, float]:
 
 
 def _colours(error: Float64) -> Float64:
-    """(k, 4) the colour of each error; red beyond `FAILED`."""
-    colours: Float64 = np.array(COLOURS(Normalize(0.0, FAILED, clip=True)(error)))
-    colours[error > FAILED] = to_rgba(LOST)
+    """(k, 3) the colour of each error; red beyond `FAILED`."""
+    colours = FIXED.rgb(error) / 255.0
+    colours[error > FAILED] = to_rgb([LOST])
     return colours

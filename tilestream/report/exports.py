@@ -20,7 +20,6 @@ from tilestream.formats.points.pcd import write_pcd
 from tilestream.model.features import SPREAD_ACROSS, SPREAD_ALONG, WEAK_ALONG
 from tilestream.model.training import PREDICTION_COLUMNS
 from tilestream.records import Float64
-from tilestream.report.colours import scale_of
 from tilestream.report.data import Findings, estimates
 from tilestream.report.measured import MEASURED_COLUMNS
 from tilestream.report.segments import segments
@@ -190,7 +189,7 @@ def write_cloud(file: Files, found: Findings) -> int:
     at = found.places[["x", "y", "z"]].to_numpy(np.float64)
     placed = np.isfinite(at).all(axis=1)
     estimate = estimates(found.places)
-    rgb = scale_of(estimate).rgb(estimate[placed]).astype(np.uint32)
+    rgb = found.scale.rgb(estimate[placed]).astype(np.uint32)
     packed = (rgb[:, 0] << 16) | (rgb[:, 1] << 8) | rgb[:, 2]
     fields = {
         "rgb": packed.view(np.float32),

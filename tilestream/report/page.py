@@ -14,7 +14,7 @@ from markupsafe import Markup
 
 from tilestream.notes import shared
 from tilestream.report import charts, evaluation, formatting
-from tilestream.report.colours import ACTUAL, CLIP, CRITERION, HELD_OUT, OTHER
+from tilestream.report.colours import ACTUAL, CRITERION, HELD_OUT, OTHER
 from tilestream.report.comparison import QUANTILE, USUAL, Comparison
 from tilestream.report.data import AROUND, Findings
 from tilestream.report.drives import EVALUATED
@@ -90,7 +90,7 @@ def report_page(
         pictures=pictures,
         ends=ends,
         shown_every=charts.map_shows_every(found),
-        clip=CLIP,
+        own_range=found.own_range,
         bridge=BRIDGE,
         apart=APART,
         heights={"around": AROUND, "low": -BELOW, "high": ABOVE, "ramp": heights_ramp()},

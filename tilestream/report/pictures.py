@@ -6,7 +6,6 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -20,9 +19,6 @@ from tilestream.report.colours import (
     HELD_OUT,
     MISSING,
     OTHER,
-    palette,
-    scale_of,
-    to_rgb,
 )
 from tilestream.report.data import AROUND, Findings, estimates
 from tilestream.report.formatting import CM_PER_M
@@ -98,13 +94,12 @@ def map_figure(found: Findings) -> Figure:
     """The city map, coloured by estimate, the worst places numbered."""
     places, estimate = found.places, estimates(found.places)
     at, known = places[["x", "y"]].to_numpy(np.float64), np.isfinite(estimate)
-    scale = scale_of(estimate)
     figure = Figure(figsize=(10.0, 7.5), layout="constrained")
     axes = figure.add_subplot()
     order = np.flatnonzero(known)[np.argsort(estimate[known], kind="stable")]
-    colours = np.array(palette())
-    step = scale.step(estimate[order])
-    axes.scatter(at[order, 0], at[order, 1], s=8 + step / 6.0, c=colours[step].tolist(), lw=0)
+    size = 8.0 + 42.0 * found.scale.step(estimate[order]) / (len(found.scale.colours) - 1)
+    shades = found.scale.shades(estimate[order])
+    axes.scatter(at[order, 0], at[order, 1], s=size, c=shades, lw=0)
     axes.scatter(at[~known, 0], at[~known, 1], s=20, c=MISSING, marker="x", lw=1.0)
     for number, row in enumerate(worst_places(places), start=1):
         box = {"boxstyle": "circle,pad=0.25", "fc": "#111111", "ec": "white"}
@@ -116,17 +111,9 @@ def map_figure(found: Findings) -> Figure:
     axes.set(xlabel="x [m]", ylabel="y [m]", title="Estimated localization error")
     axes.grid(alpha=0.25)
     axes.ticklabel_format(useOffset=False, style="plain")
-    _colour_bar(axes, scale.low, scale.high)
+    shown = found.scale.mappable(CM_PER_M)
+    figure.colorbar(shown, ax=axes, shrink=0.8, label="estimated error [cm]")
     return figure
-
-
-def _colour_bar(axes: Axes, low: float, high: float) -> None:
-    bar = axes.inset_axes((1.02, 0.1, 0.02, 0.8))
-    bar.imshow(to_rgb(palette())[:, None], origin="lower", aspect="auto",
-               extent=(0.0, 1.0, low * CM_PER_M, high * CM_PER_M))  # fmt: skip
-    bar.set(xticks=[], ylabel="estimated error [cm]")
-    bar.yaxis.set_label_position("right")
-    bar.yaxis.tick_right()
 
 
 def paths_figure(found: Findings) -> Figure:

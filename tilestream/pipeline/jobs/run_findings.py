@@ -264,6 +264,7 @@ def findings_of(
     places = with_measured(places, own, 0.5 * settings.spacing + ROUNDING)
     gathered = Findings(
         title=settings.report.title or settings.folder.name,
+        own_range=settings.report.own_range,
         places=places,
         labels=labels,
         protocols=tables["protocols"],
