@@ -18,7 +18,9 @@ from tilestream.formats.points.pcd import write_pcd
 from tilestream.formats.routes import route_of
 from tilestream.pipeline.engine import attempt as attempts
 from tilestream.pipeline.engine import executor
+from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.engine.stage import BASE_BYTES
+from tilestream.pipeline.stages.map_plan import MapPlan
 
 LENGTH = 44.0
 MOST = 10**11
@@ -78,7 +80,7 @@ def write_map(path: Path, spacing: float, strays: bool) -> None:
 
 
 def main(folder: Path) -> None:
-    """Ingest, factors, observability and labels, each task in this process."""
+    """Ingest, factors, observability, pictures and labels, each task in this process."""
     tasks: list[dict[str, Any]] = []
     executor.attempt = watched(tasks)
     store = ts.ingest(folder / "map.pcd", str(folder / "map.zarr"), map_leaf=0.0, memory=MOST)
@@ -89,6 +91,9 @@ def main(folder: Path) -> None:
     ts.observe_along(store, [route], str(folder / "run"), **how)
     starts = ts.StartSettings(radius=0.4, step=0.2)
     drive = write_drive(folder / "drive.mcap")
+    map_plan = MapPlan.of_store(store)
+    pictures = Plan.of([map_plan.above(key) for key in store.keys()], MOST)
+    executor.execute(pictures, None, None)
     ts.localize(store, drive, str(folder / "run"), starts=starts, **how)
     print(json.dumps(tasks))
 

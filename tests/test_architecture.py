@@ -19,7 +19,7 @@ FLOORS = (
     ("settings",),
     ("ndt", "preprocessing"),
     ("store", "tables", "formats", "simulation"),
-    ("local_map",),
+    ("from_above", "local_map"),
     ("registration",),
     ("label",),
     ("factors",),

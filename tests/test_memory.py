@@ -10,7 +10,7 @@ import memory
 import pytest
 
 STAGES = {
-    *("scatter", "merge", "cells", "terms", "surfels"),
+    *("scatter", "merge", "cells", "terms", "surfels", "above"),
     *("factors", "observe", "register", "label"),
 }
 

@@ -1,6 +1,7 @@
 """The page: its sections, its chart data, and what a browser makes of it without a network."""
 
 import ast
+import base64
 import html
 import json
 import re
@@ -28,13 +29,16 @@ from report_findings import (
 from report_json import charts, source
 
 import tilestream.report
+from tilestream.from_above import FromAbove
 from tilestream.model.dataset import TARGETS
 from tilestream.model.registry import COMPETITORS
 from tilestream.model.splits import PROTOCOLS
 from tilestream.report import Findings, write_report
+from tilestream.report.charts import city_map
 from tilestream.report.evaluation import MODELS, PAPER_IMPORTANCES, PARTS, PROTOCOL_NAMES, worth
 from tilestream.report.formatting import cm, cm_by_name, cm_span, percent
 from tilestream.report.page import report_page
+from tilestream.report.relief import relief_png
 from tilestream.report.segments import worst_places
 from tilestream.report.summary import AXES, STARTS, summary
 
@@ -141,12 +145,38 @@ def test_table_one_and_three_stand_beside_the_papers(found: Findings, page: Path
     assert "120 cells in view: 10 % like poles, 60 % like walls, 30 % like bushes" in text
 
 
+def test_the_map_lies_behind_the_places(found: Findings) -> None:
+    """Where it is, and as it looks from above."""
+    height = np.add.outer(np.arange(6.0), np.arange(9.0))
+    low = found.places[["x", "y"]].min().to_numpy() - 3.0
+    above = FromAbove(height, (float(low[0]), float(low[1])), 0.5)
+    chart = city_map(replace(found, above=above), "")
+    picture = values_of(chart, "ImageURL")[0]  # those that follow are of what is selected
+    (url,) = source(chart, "above")["url"]
+    assert base64.b64decode(url.removeprefix("data:image/png;base64,")) == relief_png(above)
+    assert (picture["w"]["value"], picture["h"]["value"]) == (4.5, 3.0)
+    first = source(chart, "in_domain")
+    places = found.places.set_index(["route_id", "arc_length"])
+    place = places.loc[(first["route"][0], first["arc"][0])]
+    apart = picture["x"]["value"] - first["x"][0], picture["y"]["value"] - first["y"][0]
+    assert apart == pytest.approx((low[0] - place["x"], low[1] - place["y"]), abs=1e-6)
+    assert values_of(city_map(found, ""), "ImageURL") == []
+
+
+def values_of(chart: Any, kind: str) -> list[dict[str, Any]]:
+    """The attributes of all models of a kind in a chart."""
+    if isinstance(chart, list):
+        return [value for part in chart for value in values_of(part, kind)]
+    if not isinstance(chart, dict):
+        return []
+    own = [chart["attributes"]] if chart.get("name") == kind and "attributes" in chart else []
+    return own + [value for part in chart.values() for value in values_of(part, kind)]
+
+
 def test_the_map_holds_every_place_once(found: Findings, page: Path) -> None:
     chart = charts(page)["city-map"]
     places = found.places.set_index(["route_id", "arc_length"])
-    labels = dict(
-        re.findall(r'"axis_label": "([xy]) − (\d+) m"', json.dumps(chart, ensure_ascii=False))
-    )
+    labels = dict(re.findall(r'"axis_label": "([xy]) \[m\] from (\d+) on"', json.dumps(chart)))
     origin = np.array([float(labels["x"]), float(labels["y"])])
     seen = set()
     for kind in ("in_domain", "outside", "missing"):

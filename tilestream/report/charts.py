@@ -1,5 +1,6 @@
 """The charts that answer to the mouse: Bokeh documents as plain JSON, the same bytes every time."""
 
+import base64
 import itertools
 from typing import Any
 
@@ -15,11 +16,13 @@ from bokeh.models import (
     LinearColorMapper,
     NumeralTickFormatter,
 )
-from bokeh.models.annotations.legends import ColorBar
+from bokeh.models.annotations.labels import Label
+from bokeh.models.annotations.legends import ColorBar, ScaleBar
 from bokeh.models.renderers import GlyphRenderer
 from bokeh.plotting import figure
 from numpy.typing import NDArray
 
+from tilestream.from_above import FromAbove
 from tilestream.records import Float64, Int64
 from tilestream.report.colours import (
     ACTUAL,
@@ -34,6 +37,7 @@ from tilestream.report.data import Findings, estimates, like_training
 from tilestream.report.formatting import CM_PER_M, cm, cm_about, cm_by_name, cm_span, percent
 from tilestream.report.lines import path_lines, points_per_mark, with_gaps, worst_of_every
 from tilestream.report.measured import measure_of
+from tilestream.report.relief import relief_png
 from tilestream.report.segments import worst_places
 from tilestream.report.summary import AXES, STARTS
 
@@ -65,13 +69,30 @@ NUMBER: dict[str, Any] = {
     "padding": 4,
 }
 """How the number of one of the worst places looks."""
+SCALE_BAR: dict[str, Any] = {
+    "unit": "m",
+    "location": "bottom_left",
+    "orientation": "horizontal",
+    "background_fill_alpha": 0.0,
+    "border_line_alpha": 0.0,
+    "bar_line_color": "#828a94",
+}
+NORTH: dict[str, Any] = {
+    "x": 16,
+    "y": 52,
+    "x_units": "screen",
+    "y_units": "screen",
+    "text": "N ↑",
+    "text_font_size": "13px",
+}
 
 
 def city_map(found: Findings, tip: str) -> dict[str, Any]:
     """The sample points coloured by estimate, the worst on top and numbered, as an item for
     `Bokeh.embed.embed_item`.
 
-    The data sources are named `in_domain`, `outside`, `unjudged`, `missing` and `worst`.
+    The data sources are named `above`, `in_domain`, `outside`, `unjudged`, `missing`, `measured` and
+    `worst`.
 
     Args:
         found: what is reported.
@@ -82,6 +103,7 @@ def city_map(found: Findings, tip: str) -> dict[str, Any]:
     plot = _new_plot(600, "x", "y", MAP_TOOLS, match_aspect=True)
     drawn = worst_of_every(map_shows_every(found), places["route_id"], estimate)
     origin = _origin(places)
+    _draw_map(plot, found.above, origin)
     kinds = _kinds(places)
     mapper = LinearColorMapper(palette=found.scale.colours, low=0, high=len(found.scale.colours))
     for kind, marker, name in (
@@ -106,21 +128,43 @@ def city_map(found: Findings, tip: str) -> dict[str, Any]:
     _draw_measured(plot, found, origin, (tip, mapper))
     _number_the_worst(plot, places, origin)
     if np.isfinite(estimate).any():
-        plot.add_layout(_colour_bar(found.scale, mapper), "right")
+        plot.add_layout(_colour_bar(found.scale, mapper), "below")
     plot.xaxis.axis_label, plot.yaxis.axis_label = (
-        f"{axis} − {value:.0f} m" if value else f"{axis} [m]"
+        f"{axis} [m] from {value:.0f} on" if value else f"{axis} [m]"
         for axis, value in zip("xy", origin, strict=True)
     )
     _finish(plot)
     return _item(plot, "city-map")
 
 
+def _draw_map(plot: figure, above: FromAbove | None, origin: Float64) -> None:
+    """The map itself below all else, how long it is, and where north is."""
+    plot.add_layout(ScaleBar(**SCALE_BAR))
+    plot.add_layout(Label(**NORTH))
+    if above is None:
+        return
+    data = base64.b64encode(relief_png(above)).decode()
+    rows, columns = above.height.shape
+    plot.image_url(
+        url="url",
+        source=ColumnDataSource({"url": [f"data:image/png;base64,{data}"]}, name="above"),
+        x=above.corner[0] - origin[0],
+        y=above.corner[1] - origin[1],
+        w=columns * above.pixel,
+        h=rows * above.pixel,
+        anchor="bottom_left",
+        level="underlay",
+    )
+
+
 def _colour_bar(scale: Scale, mapper: LinearColorMapper) -> ColorBar:
-    """Equally high steps, with the error between two of them."""
+    """Equally wide steps, with the error between two of them; below the map, which is narrow on
+    a phone.
+    """
     return ColorBar(
         color_mapper=mapper,
         title="error [cm]",
-        width=12,
+        height=12,
         padding=4,
         ticker=FixedTicker(ticks=list(range(1, len(scale.colours)))),
         major_label_overrides={
@@ -324,7 +368,7 @@ def _new_plot(height: int, x: str, y: str, tools: str, **options: Any) -> figure
         output_backend="canvas",
         **options,
     )
-    plot.toolbar.logo = None
+    plot.toolbar.logo, plot.toolbar_location = None, "above"
     return plot
 
 

@@ -9,6 +9,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from tilestream.errors import UsageError
+from tilestream.from_above import FromAbove
 from tilestream.model.registry import DEFAULT
 from tilestream.model.training import PREDICTION_COLUMNS
 from tilestream.notes import Notes
@@ -21,6 +22,8 @@ PLACE_COLUMNS = ("route_id", "sample", "arc_length", "heading", "x", "y", "z")
 """Where a sample point is: its route, its number there, and the map frame [m, rad]."""
 LABEL_COLUMNS = ("group", "path", "block", "arc_length", "error_mean", "held_out", "low", "high")
 """What a labelled place must have."""
+BESIDE = 60.0
+"""How far beside the places the map is drawn behind them [m]."""
 AROUND = 40.0
 """How far round a place its picture reaches [m]."""
 Ends = Callable[[str, int], pd.DataFrame]
@@ -84,6 +87,8 @@ class Findings:
     """What the estimates are worth; None: nobody has said it."""
     own_range: bool = False
     """Colours of the estimates' own range instead of those that all reports have."""
+    above: FromAbove | None = None
+    """The map behind the places, from above; None: they are drawn on nothing."""
     cell_size: float | None = None
     """Edge of the cells that labels were measured with [m]; None: not known."""
     crs: str | None = None

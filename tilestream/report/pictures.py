@@ -6,11 +6,13 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from tilestream.from_above import FromAbove
 from tilestream.records import Float64
 from tilestream.report.colours import (
     ACTUAL,
@@ -23,6 +25,7 @@ from tilestream.report.colours import (
 from tilestream.report.data import AROUND, Findings, estimates
 from tilestream.report.formatting import CM_PER_M
 from tilestream.report.lines import path_lines
+from tilestream.report.relief import relief
 from tilestream.report.segments import worst_places
 
 PIXEL = 0.25
@@ -96,6 +99,7 @@ def map_figure(found: Findings) -> Figure:
     at, known = places[["x", "y"]].to_numpy(np.float64), np.isfinite(estimate)
     figure = Figure(figsize=(10.0, 7.5), layout="constrained")
     axes = figure.add_subplot()
+    _draw_map(axes, found.above)
     order = np.flatnonzero(known)[np.argsort(estimate[known], kind="stable")]
     size = 8.0 + 42.0 * found.scale.step(estimate[order]) / (len(found.scale.colours) - 1)
     shades = found.scale.shades(estimate[order])
@@ -114,6 +118,15 @@ def map_figure(found: Findings) -> Figure:
     shown = found.scale.mappable(CM_PER_M)
     figure.colorbar(shown, ax=axes, shrink=0.8, label="estimated error [cm]")
     return figure
+
+
+def _draw_map(axes: Axes, above: FromAbove | None) -> None:
+    """The map itself, below all else."""
+    if above is None:
+        return
+    (left, low), (rows, columns) = above.corner, above.height.shape
+    extent = left, left + columns * above.pixel, low, low + rows * above.pixel
+    axes.imshow(relief(above), extent=extent, interpolation="nearest", zorder=0)
 
 
 def paths_figure(found: Findings) -> Figure:

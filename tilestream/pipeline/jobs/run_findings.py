@@ -10,6 +10,7 @@ import pandas as pd
 from tilestream.errors import ModelError
 from tilestream.factors.along_route import WIDTH
 from tilestream.factors.heights import note_of_drive, notes_of_routes
+from tilestream.from_above import FromAbove, seen_from_above
 from tilestream.grid import MM_PER_M, Box
 from tilestream.model.dataset import POINTS_MIN, TARGETS, Dataset, nearest_along
 from tilestream.model.evaluation import (
@@ -32,13 +33,15 @@ from tilestream.pipeline.jobs.run_worth import worth_of
 from tilestream.pipeline.stages.evaluate import by_protocol
 from tilestream.pipeline.stages.samples import places_with_factors
 from tilestream.records import Float64
-from tilestream.report.data import AROUND, Findings
+from tilestream.report.data import AROUND, BESIDE, Findings
 from tilestream.report.measured import with_measured
 from tilestream.report.worth import Worth
 from tilestream.store import TileStore
 from tilestream.tables import read_tables
 
 PLACE = ["route_id", "sample"]
+MOST_PIXELS = 1_200_000
+"""Of the map behind the places."""
 ROUNDING = 1e-6
 """How far a label may be beyond half a spacing of the place that has it [m]."""
 _NO_POINTS = pd.DataFrame({name: [] for name in ("row", "estimate", "low", "high")})
@@ -280,9 +283,19 @@ def findings_of(
         crs=store.settings.crs,
         worth=worth,
         around=lambda x, y, _: points_around(store, x, y, AROUND),
+        above=_above(done, store, places),
     )
     evaluation = {name: table.to_dict("records") for name, table in tables.items()}
     return gathered, evaluation | {"ceilings": ceiling_of, "worth": worth.plain()}
+
+
+def _above(done: Done, store: TileStore, places: pd.DataFrame) -> FromAbove | None:
+    """The map behind the places; None: of none of them is the position known."""
+    at = places[["x", "y"]].dropna().to_numpy(np.float64)
+    tiles = [task.tile for task in done.outputs("above") if task.tile is not None]
+    if not len(at) or not tiles:
+        return None
+    return seen_from_above(store, tiles, Box.around(at, BESIDE), MOST_PIXELS)
 
 
 def _worth(

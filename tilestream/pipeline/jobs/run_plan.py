@@ -1,5 +1,6 @@
 """What the main job runs: tiles, factors and errors; then what is learnt of them."""
 
+import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
@@ -8,6 +9,7 @@ from tilestream.errors import SourceError, SourceNotFoundError, TileNotReadyErro
 from tilestream.factors import catalogue
 from tilestream.factors.along_route import REACH
 from tilestream.factors.own import own_factors
+from tilestream.from_above import tiles_around
 from tilestream.grid import MM_PER_M, TileGrid, TileKey
 from tilestream.model.baselines import Median
 from tilestream.model.dataset import TARGETS
@@ -41,6 +43,7 @@ from tilestream.pipeline.stages.observe import observe_drive
 from tilestream.pipeline.stages.predict import predict
 from tilestream.pipeline.stages.samples import COLUMNS, DatasetFile, samples
 from tilestream.pipeline.stages.train import ModelFile, ModelInUse, train
+from tilestream.report.data import BESIDE
 from tilestream.settings import DriveSettings
 
 OF_DRIVES = (factors_drive.name, observe_drive.name)
@@ -79,7 +82,13 @@ def plan_measure(settings: RunSettings, inputs: Inputs, map_plan: MapPlan) -> Pl
         plans.append(plan_observe(map_plan, places, tables, observing, memory))
     plans += _plans_of_drives(settings, good, map_plan)
     plans += localized.values()
-    measured = Plan.of((task for plan in plans for task in plan.tasks), memory)
+    pictures = [
+        map_plan.above(key)
+        for key in tiles_around(map_plan.store, places, BESIDE)
+        if key in map_plan.points
+    ]
+    tasks = itertools.chain(*(plan.tasks for plan in plans), pictures)
+    measured = Plan.of(tasks, memory)
     return replace(measured, left_out=left_out)
 
 

@@ -7,10 +7,12 @@ import numpy as np
 
 from tilestream.factors.surfels import surfel_mm, surfels_table
 from tilestream.factors.terms import terms_table
+from tilestream.from_above import above_table
 from tilestream.grid import Box, TileKey
 from tilestream.marks import hash_of
 from tilestream.pipeline.engine.outputs import TileArrays
 from tilestream.pipeline.engine.stage import Stage, Task
+from tilestream.pipeline.stages.above import above
 from tilestream.pipeline.stages.cells import cells
 from tilestream.pipeline.stages.map_part import MapPart
 from tilestream.pipeline.stages.surfels import surfels
@@ -117,6 +119,10 @@ class MapPlan:
     def surfels(self, key: TileKey) -> Task:
         """The task that makes the surfels of a tile."""
         return self._made(surfels, surfels_table(surfel_mm(self.store)), str(key), key, [])
+
+    def above(self, key: TileKey) -> Task:
+        """The task that makes the picture of a tile from above."""
+        return self._made(above, above_table(), str(key), key, [])
 
     def part(self, keys: Sequence[TileKey], made: Sequence[Task]) -> MapPart:
         """Some tiles as a task reads them.

@@ -19,6 +19,10 @@
             model.setv({ grid_line_color: line });
           } else if (model.type === "Legend") {
             model.setv({ label_text_color: ink, inactive_fill_color: night ? "#1d2126" : "#ffffff" });
+          } else if (model.type === "ScaleBar") {
+            model.setv({ label_text_color: ink });
+          } else if (model.type === "Label") {
+            model.setv({ text_color: ink });
           } else if (model.type === "ColorBar") {
             model.setv({ title_text_color: ink, major_label_text_color: ink, title_text_font_style: "normal" });
           }
