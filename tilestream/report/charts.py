@@ -91,8 +91,8 @@ def city_map(found: Findings, tip: str) -> dict[str, Any]:
     """The sample points coloured by estimate, the worst on top and numbered, as an item for
     `Bokeh.embed.embed_item`.
 
-    The data sources are named `above`, `in_domain`, `outside`, `unjudged`, `missing`, `measured` and
-    `worst`.
+    The data sources are named `above`, `in_domain`, `outside`, `unjudged`, `missing`, `measured`
+    and `worst`.
 
     Args:
         found: what is reported.
