@@ -69,6 +69,8 @@ NUMBER: dict[str, Any] = {
     "padding": 4,
 }
 """How the number of one of the worst places looks."""
+HERE = "#d55e00"
+"""Of the ring round the place that the page's address names."""
 SCALE_BAR: dict[str, Any] = {
     "unit": "m",
     "location": "bottom_left",
@@ -91,8 +93,8 @@ def city_map(found: Findings, tip: str) -> dict[str, Any]:
     """The sample points coloured by estimate, the worst on top and numbered, as an item for
     `Bokeh.embed.embed_item`.
 
-    The data sources are named `above`, `in_domain`, `outside`, `unjudged`, `missing`, `measured`
-    and `worst`.
+    The data sources are named `above`, `in_domain`, `outside`, `unjudged`, `missing`, `measured`,
+    `worst` and `here`.
 
     Args:
         found: what is reported.
@@ -127,6 +129,9 @@ def city_map(found: Findings, tip: str) -> dict[str, Any]:
         plot.add_tools(_hover(glyphs, tip, sort_by=[("estimate", -1)]))
     _draw_measured(plot, found, origin, (tip, mapper))
     _number_the_worst(plot, places, origin)
+    plot.name, plot.tags = "city-map", origin.tolist()  # by which the page finds a place on it
+    here = ColumnDataSource({"x": [], "y": []}, name="here")
+    plot.scatter("x", "y", source=here, size=26, fill_alpha=0.0, line_width=3, line_color=HERE)
     if np.isfinite(estimate).any():
         plot.add_layout(_colour_bar(found.scale, mapper), "below")
     plot.xaxis.axis_label, plot.yaxis.axis_label = (

@@ -87,6 +87,7 @@ def report_page(
         routes=_listed_routes(content["routes"]),
         segments=segments[:MOST_SEGMENTS],
         paths=paths,
+        absent=_absent(content, ends),
         pictures=pictures,
         ends=ends,
         shown_every=charts.map_shows_every(found),
@@ -96,6 +97,32 @@ def report_page(
         heights={"around": AROUND, "low": -BELOW, "high": ABOVE, "ramp": heights_ramp()},
         parts=(AXES, STARTS),
     )
+
+
+def _absent(content: Mapping[str, Any], ends: bytes | str) -> dict[str, str]:
+    """Why sections of a run's page have nothing to say, by section: they are left out."""
+    labelled = content["headline"]["labelled"]
+    judged = (
+        "nothing was trained on the labels of this run, so no models were judged against each "
+        "other; the estimates stand beside what was measured"
+        if labelled
+        else "there were no labels, so nothing can be judged: the estimates rest on the model"
+    )
+    unlabelled = "no place was labelled: without a log of scans there is no measured error"
+    why = {
+        "paths": (content["paths"], unlabelled),
+        "ends": (isinstance(ends, bytes), str(ends)),
+        "table-i": (content["table_i"], unlabelled),
+        "table-iii": (content["table_iii"], unlabelled),
+        "importances": (content["importances"], "nothing was trained in this run"),
+        "table-iv": (content["table_iv"], judged),
+        "calibration": (
+            content["coverage"],
+            "no interval was checked: that takes a model trained here, on several paths",
+        ),
+        "protocols": (content["protocols"], judged),
+    }
+    return {name: reason for name, (there, reason) in why.items() if not there}
 
 
 def comparison_page(found: Comparison, content: Mapping[str, Any]) -> str:

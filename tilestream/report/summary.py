@@ -185,6 +185,7 @@ def segment(places: pd.DataFrame, rows: Int64) -> dict[str, Any]:
         "worst": float(error.known[row]),
         "worst_measured": bool(error.known[row] == error.measured[row]),
         "worst_at": float(worst["arc_length"]),
+        **{axis: float(worst[axis]) for axis in "xy"},  # of its worst place
         "mean": float(part["estimate"].mean()),
         **{name: float(worst[name]) for name in (*AXES, *STARTS)},
         "p_fail": float(part["p_fail"].max()),

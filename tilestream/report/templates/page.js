@@ -31,6 +31,31 @@
     }
   }
 
+  // Shows the place that the address names, `#x=…&y=…` in the map's frame: a link to it can be sent.
+  function go() {
+    const at = new URLSearchParams(location.hash.slice(1));
+    const map = Bokeh.documents.flatMap((doc) => doc.roots()).find((root) => root.name === "city-map");
+    if (!map || !at.has("x") || !at.has("y")) {
+      return;
+    }
+    const [x, y] = [Number(at.get("x")) - map.tags[0], Number(at.get("y")) - map.tags[1]];
+    if (!Number.isFinite(x) || !Number.isFinite(y)) {
+      return;
+    }
+    const high = 50;
+    const wide = high * (map.inner_width / map.inner_height || 1);
+    for (const [range, middle, half] of [[map.x_range, x, wide], [map.y_range, y, high]]) {
+      range.have_updated_interactively = true; // as if by the mouse: data no longer move it
+      range.setv({ start: middle - half, end: middle + half });
+    }
+    for (const model of map.references()) {
+      if (model.name === "here") {
+        model.data = { x: [x], y: [y] };
+      }
+    }
+    document.getElementById("map").scrollIntoView();
+  }
+
   Bokeh.set_log_level("warn");
   const items = [...document.querySelectorAll("script.chart-data")].map((s) => JSON.parse(s.textContent));
   Promise.all(items.map((item) => Bokeh.embed.embed_item(item))).then(() => {
@@ -38,6 +63,8 @@
     dark.addEventListener("change", paint);
     window.addEventListener("beforeprint", paint);
     window.addEventListener("afterprint", paint);
+    window.addEventListener("hashchange", go);
+    go();
     document.documentElement.dataset.charts = String(items.length);
   });
 })();
