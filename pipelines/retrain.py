@@ -215,8 +215,8 @@ def retrain(wanted: Retraining) -> str:
 
 def on_real_drives(found: dict[str, Any]) -> dict[str, Any]:
     """What a card keeps of real drives: counts, the pooled rank correlation with its interval, by
-    how much estimates are off, the share of the errors that the intervals hold with its standard
-    error, and both and the level (estimated / measured, medians) by lidar.
+    how much estimates are off and their median, the share of the errors that the intervals hold
+    with its standard error, and both and the level (estimated / measured, medians) by lidar.
     """
     streets = [name for name in found["pooled"] if name != "all"]
     of_model = found["model"]["all"]
@@ -232,6 +232,7 @@ def on_real_drives(found: dict[str, Any]) -> dict[str, Any]:
         "streets": streets,
         "spearman": [pooled[name] for name in ("value", "low", "high")],
         "mae_m": of_model["all"]["off"]["value"],
+        "median_m": of_model["all"]["estimated"]["value"],
         "coverage": held.pop("all"),
         "coverage_by_lidar": held,
         "mae_m_by_lidar": {name: one["off"]["value"] for name, one in lidars.items()},

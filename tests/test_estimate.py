@@ -339,3 +339,31 @@ def test_labels_that_are_lost_leave_too_few(
     assert list(told["failures"]) == ["labels"]
     places = places_of(tmp_path / "run")
     assert (places["estimate"] == places["vd_mean"]).all()
+
+
+@pytest.mark.parametrize(
+    ("sensor", "model", "asked", "seen"),
+    [
+        ("HDL64", "shipped", None, 100.0),
+        ("HDL64", "shipped", 110.0, 110.0),
+        ("VLP16", "shipped", None, None),
+        ("HDL64", "physics", None, None),
+    ],
+)
+def test_virtual_scans_reach_as_far_as_the_model_knows_unless_told(
+    sensor: str, model: str, asked: float | None, seen: float | None, tmp_path: Path
+) -> None:
+    """The model that ships knows 15 to 100 m, and an HDL-64 has 120."""
+    settings = estimate_settings(
+        ["map.pcd"],
+        ["route.csv"],
+        tmp_path / "run",
+        model,
+        PlaceSettings(sensor=sensor),
+        VirtualSettings(range_max=asked),
+        LabelSettings(),
+        MapSettings(),
+        ReportSettings(),
+    )
+    assert settings.observe is not None
+    assert settings.observe.range_max == seen

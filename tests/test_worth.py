@@ -84,7 +84,9 @@ def test_the_card_says_where_it_was_checked() -> None:
     assert worth(card=real).checked == OWN
 
 
-keys = st.sampled_from(["places", "drives", "spearman", "level", "coverage", "mae_m", "skill"])
+keys = st.sampled_from(
+    ["places", "drives", "spearman", "level", "coverage", "mae_m", "median_m", "skill"]
+)
 values = st.none() | st.floats() | st.text(max_size=3) | st.lists(st.floats() | st.none())
 entries = st.dictionaries(keys, values | st.dictionaries(st.text(max_size=3), values))
 names = st.sampled_from(["real drives", "held-out paths", "held-out lidar"])
@@ -146,3 +148,15 @@ def test_no_more_digits_are_told_and_none_is_wrong(metres: float, digits: int) -
     told = cm_about(metres, digits).split("\u00a0")[0]
     assert float(told) == pytest.approx(100.0 * metres, rel=0.51 * 10.0 ** (1 - digits))
     assert len(told.replace(".", "").strip("0")) <= digits
+
+
+@pytest.mark.parametrize("entry", ["real drives", "held-out paths"])
+def test_elsewhere_estimates_are_off_in_proportion(entry: str) -> None:
+    """A street of good places has smaller estimates, which are off by less."""
+    card = {**CARD, "checked": {entry: {"places": 900, "mae_m": 0.06, "median_m": 0.12}}}
+    found = worth(card=card, shipped=True)
+    assert found.median is not None
+    assert found.mae == pytest.approx(0.5 * found.median)
+    assert found.share == pytest.approx(0.5)
+    here = worth(labels([0.04, 0.05], [0.05, 0.06]), card=card, shipped=True)
+    assert here.mae == pytest.approx(0.01)  # what was measured here counts as it is

@@ -33,12 +33,12 @@ def checked_of(dataset: Dataset, recipe: str, seed: int = 0) -> dict[str, Any]:
 
     Returns:
         Plain JSON: for `held-out paths`, `held-out lidar` and `held-out district` the places,
-        `mae_m` [m], `skill`, `segment_skill` and `spearman` (each with the ends of its 90 %
-        interval), `coverage` (with its standard error), `over_physics` (by how much the skill is
-        larger than that of the virtual drive plus one number, with its ends) and, for paths,
-        `p_fail` (whose `mae` is a share) and `error_tail` likewise; of lidars and districts
-        `of_paths`, their skill as a share of that of the same places on held-out paths. What cannot
-        be held out is left out.
+        `mae_m`, `median_m` (of the estimates) [m], `skill`, `segment_skill` and `spearman` (each
+        with the ends of its 90 % interval), `coverage` (with its standard error), `over_physics`
+        (by how much the skill is larger than that of the virtual drive plus one number, with its
+        ends) and, for paths, `p_fail` (whose `mae` and `median` are shares) and `error_tail`
+        likewise; of lidars and districts `of_paths`, their skill as a share of that of the same
+        places on held-out paths. What cannot be held out is left out.
     """
     protocols = {one.name: one for one in protocols_of(dataset) if one.name in HELD_OUT}
     found: dict[str, Any] = {}
@@ -52,7 +52,8 @@ def checked_of(dataset: Dataset, recipe: str, seed: int = 0) -> dict[str, Any]:
             points = held_out(dataset, splits, recipe, target, seed)
             physics = held_out(dataset, splits, Physics.name, target, seed)
             told = _figures(points, physics)
-            told["mae" if target in SHARES else "mae_m"] = told.pop("off")
+            unit = "" if target in SHARES else "_m"
+            told |= {f"{name}{unit}": told.pop(name) for name in ("mae", "median")}
             if target != TARGETS[0]:
                 found[HELD_OUT[name]][target] = told
                 continue
@@ -70,7 +71,8 @@ def _figures(points: pd.DataFrame, physics: pd.DataFrame) -> dict[str, Any]:
     return {
         "places": len(points),
         "blocks": int(points["block"].nunique()),
-        "off": figures["mae"],
+        "mae": figures["mae"],
+        "median": float(points["estimate"].median()),
         **{name: _ended(figures, name) for name in ("skill", "segment_skill", "spearman")},
         "coverage": [float(whole["covered"]), float(whole["error"])],
         "over_physics": _ended(against, "skill"),

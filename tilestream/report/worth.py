@@ -30,7 +30,8 @@ class Worth:
     drives: int | None = None
     """Of how many drives."""
     mae: float | None = None
-    """Expected error of an estimate: its mean absolute error [m] …"""
+    """Expected error of an estimate: its mean absolute error [m], in proportion to the estimates
+    where it was found on another street …"""
     mae_of: str = ""
     """… and where that was found; most often where it was checked."""
     spearman: float | None = None

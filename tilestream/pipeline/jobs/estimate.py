@@ -8,14 +8,16 @@ from typing import Any
 
 from tilestream.config import Settings
 from tilestream.errors import StoreNotFoundError, UsageError
+from tilestream.files import Files
 from tilestream.matcher import RegistrationSettings
+from tilestream.model.file import load_model
 from tilestream.model.registry import UNTRAINED
-from tilestream.model.shipped import SHIPPED, is_shipped
+from tilestream.model.shipped import SHIPPED, file_of, is_shipped
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY
 from tilestream.pipeline.jobs.run import run
 from tilestream.pipeline.jobs.run_settings import ModelSettings, RunSettings
-from tilestream.sensor import VLP16, Carrier
+from tilestream.sensor import VLP16, Carrier, sensor_of
 from tilestream.settings import (
     LabelSettings,
     MapSettings,
@@ -64,7 +66,7 @@ def estimate(
             drive as it is. None: the one that ships, or `physics` where none does, which is logged.
         sensor: the vehicle's lidar, or lidars: a name that ships, a YAML file, or its data.
         sensor_height: height of the lidar above the road [m].
-        range_max: its usable range [m]; None: the sensor's.
+        range_max: its usable range [m]; None: the sensor's, as far as the model knows it.
         blind_rear_deg: sector to the rear that the vehicle hides [deg].
         matcher: the vehicle's scan matcher: `autoware`, `default`, its settings, or Autoware's own
             parameter file or folder.
@@ -134,17 +136,32 @@ def estimate_settings(
         UsageError: a store among other sources, or values that cannot be.
         StoreError: a store that cannot be opened.
     """
+    of_model = _model_of(model)
     values: Mapping[str, Any] = {name: getattr(places, name) for name in places.model_fields_set}
     return RunSettings(
         **values,
         out=os.fspath(out),
         map=map_.model_copy(update=_map_of(sources)),
         routes=tuple(routes),
-        observe=seeing,
+        observe=_as_far_as_known(seeing, places.sensor, of_model.use),
         label=label,
-        model=_model_of(model),
+        model=of_model,
         report=report,
     )
+
+
+def _as_far_as_known(
+    seeing: VirtualSettings, sensor: Carrier | str, use: str | None
+) -> VirtualSettings:
+    """Where no usable range was asked for, at most the farthest that the model was trained over:
+    what lies beyond tells little, and all places would be unlike the training places.
+    """
+    if seeing.range_max is not None or use is None or not Files.at(file_of(use)).there():
+        return seeing
+    known = load_model(file_of(use)).card.get("inputs", {}).get("range_m")
+    if known is None or not known[1] < sensor_of(sensor).range_max:
+        return seeing
+    return seeing.model_copy(update={"range_max": float(known[1])})
 
 
 def _map_of(sources: Sequence[str]) -> dict[str, Any]:

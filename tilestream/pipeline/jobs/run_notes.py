@@ -67,10 +67,20 @@ def with_logs(
 
 def run_notes(settings: RunSettings, inputs: Inputs, store: TileStore) -> dict[str, list[str]]:
     """All that was noticed of the inputs of a run whose map is there, by source."""
-    own = {JOB: _on_degraded(settings, inputs), MATCHER: settings.label.registration.notes}
+    of_job = [*_on_range(settings), *_on_degraded(settings, inputs)]
+    own = {JOB: of_job, MATCHER: settings.label.registration.notes}
     known = () if store.manifest is None else store.manifest.identities
     far = {"routes": off_map(known, store.grid, inputs.routes)}
     return noticed(inputs.notes, own, far, map_notes(store))
+
+
+def _on_range(settings: RunSettings) -> list[str]:
+    """A note where virtual scans end before the lidar's range does."""
+    used = None if settings.observe is None else settings.observe.range_max
+    most = settings.looking_sensor.range_max
+    if used is None or used >= most:
+        return []
+    return [f"virtual scans reach {used:g} m of the lidar's {most:g} m (observe.range_max)"]
 
 
 def _on_degraded(settings: RunSettings, inputs: Inputs) -> list[str]:

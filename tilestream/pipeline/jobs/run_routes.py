@@ -68,7 +68,8 @@ def _lanes(files: list[str], settings: RunSettings) -> tuple[RoutesRead, list[st
             f"{settings.out}: no routes: all {len(lanes)} lanes of {', '.join(files)} are shorter "
             f"than the spacing, {settings.spacing:g} m"
         )
-    told = f"no routes were given: all streets of the map, {len(long)} lanes of {', '.join(files)}"
+    many = f"{len(long)} lane{'' if len(long) == 1 else 's'}"
+    told = f"no routes were given: all streets of the map, {many} of {', '.join(files)}"
     short = len(lanes) - len(long)
     told += f"; {short} shorter than the spacing are left out" if short else ""
     return replace(read, routes=long), files, told

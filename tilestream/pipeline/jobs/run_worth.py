@@ -59,10 +59,14 @@ def worth_of(
     like = like_training(places)
     compared = int((like != "not known").sum())
     trained = _trained(card, facts)
+    checks = _checks(labels, card, blocks, shipped, (simulated, trained["simulated"]))
+    median, there = None if at is None else float(estimate[at]), checks.pop("median", None)
+    if there and median is not None and checks["mae"] is not None:
+        checks["mae"] *= median / there  # larger errors are off by more
     return Worth(
         model=model,
-        **_checks(labels, card, blocks, shipped, (simulated, trained["simulated"])),
-        median=None if at is None else float(estimate[at]),
+        **checks,
+        median=median,
         **_ends(places, at),
         outside=int((like == "no").sum()) / compared if compared else None,
         **trained,
@@ -159,18 +163,22 @@ def _of_card(checked: Any, shipped: bool, simulated: bool) -> dict[str, Any]:
     real = entries.pop(REAL, None)
     held = [one for one in entries.values() if isinstance(one, Mapping)]
     # of what was held out, the protocol with the largest error: the most honest one
-    errors = [error for one in held if (error := _number(one.get("mae_m"))) is not None]
-    mae = max(errors, default=None)
+    errors = [one for one in held if _number(one.get("mae_m")) is not None]
+    worst = _off(max(errors, key=lambda one: float(one["mae_m"]))) if errors else _off({})
     if isinstance(real, Mapping):
-        own = _number(real.get("mae_m"))
-        where = ELSEWHERE if shipped else OWN
-        of = {"mae": mae if own is None else own, "mae_of": HELD_OUT if own is None else where}
+        where, own = ELSEWHERE if shipped else OWN, _off(real)
+        of = worst | {"mae_of": HELD_OUT} if own["mae"] is None else own | {"mae_of": where}
         return {"checked": where, **_entry(real), **of}
     if not held:
         return {"checked": NOWHERE}
     most = max(held, key=lambda one: _whole(one.get("places")) or 0)
     where = SIMULATION if shipped or simulated else OWN
-    return {"checked": where, **_entry(most), "mae": mae, "mae_of": where}
+    return {"checked": where, **_entry(most), **worst, "mae_of": where}
+
+
+def _off(of: Mapping[str, Any]) -> dict[str, Any]:
+    """How far estimates were off on average, and their median [m]."""
+    return {"mae": _number(of.get("mae_m")), "median": _number(of.get("median_m"))}
 
 
 def _entry(of: Mapping[str, Any]) -> dict[str, Any]:
