@@ -20,7 +20,17 @@ from tilestream.from_above import (
     tiles_around,
 )
 from tilestream.grid import MM_PER_M, Box
-from tilestream.report.relief import FAINT, GREY, HIGH, STRONG, relief, relief_png
+from tilestream.report.relief import (
+    BLOCK,
+    FAINT,
+    GREY,
+    HIGH,
+    LEAST,
+    LOW,
+    STRONG,
+    relief,
+    relief_png,
+)
 
 Floats = NDArray[np.float64]
 
@@ -154,13 +164,25 @@ def test_what_is_higher_is_no_fainter_and_heights_above_the_sea_do_not_show(
     there = np.isfinite(height)
     assert (opacity[there] >= np.floor(255.0 * FAINT)).all()
     assert (opacity[there] <= np.ceil(255.0 * STRONG)).all()
-    if there.any() and max(rows, columns) * pixel < 20.0:  # one ground for all
-        above = (height - np.nanmin(height))[there]
-        order = np.argsort(above, kind="stable")
+    if max(rows, columns) <= max(LEAST, round(BLOCK / pixel)):  # one square, one ground
+        known = np.sort(height[there])
+        low = known[int(LOW * (len(known) - 1))] if len(known) >= LEAST else np.inf
+        order = np.argsort(height[there], kind="stable")
         assert (np.diff(opacity[there][order]) >= 0.0).all()
-        assert (opacity[there][above >= HIGH] == round(255.0 * STRONG)).all()
+        assert (opacity[there & (height - low >= HIGH)] == round(255.0 * STRONG)).all()
+        assert (opacity[there & (height <= low)] == round(255.0 * FAINT)).all()
     whole = FromAbove(height + np.round(sea), (0.0, 0.0), pixel)
     np.testing.assert_array_equal(relief(whole)[::-1], image)
+
+
+def test_strays_below_the_road_darken_nothing() -> None:
+    rng = np.random.default_rng(0)
+    height = np.where(rng.random((200, 300)) < 0.1, 8.0, 0.0)
+    image = relief(FromAbove(height, (0.0, 0.0), 0.25))
+    strays = rng.random(height.shape) < 0.02
+    spoilt = relief(FromAbove(np.where(strays, -16.0, height), (0.0, 0.0), 0.25))
+    np.testing.assert_array_equal(spoilt[~strays[::-1]], image[~strays[::-1]])
+    assert len(np.unique(image[..., 3])) == 2
 
 
 def test_a_png_is_read_back(tmp_path: Path) -> None:
