@@ -38,7 +38,7 @@ def table(run_dir: Path) -> str:
     places = pd.read_parquet(run_dir / "report" / "places.parquet")
     said = places[["route_id", "arc_length", "estimate", "low", "high"]]
     said = said.rename(columns={"route_id": "path"})
-    rows = nearest_along(ts.dataset(run_dir).rows, said, REACH).dropna(subset="estimate")
+    rows = nearest_along(ts.dataset(run_dir), said, REACH).dropna(subset="estimate")
     lines = [
         "| drive | points | measured, mean | median | estimated, median | MAE | Spearman | held |",
         "|---|---|---|---|---|---|---|---|",

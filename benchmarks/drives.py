@@ -57,6 +57,7 @@ from tilestream.errors import PartialError
 from tilestream.model.dataset import Dataset
 from tilestream.model.file import load_model
 from tilestream.model.training import Model, predict
+from tilestream.pipeline.jobs.run import dataset_of
 from tilestream.pipeline.jobs.train_over import as_read
 
 LIDARS: dict[str, dict[str, float]] = {
@@ -131,7 +132,7 @@ def measured(given: argparse.Namespace) -> tuple[pd.DataFrame, pd.DataFrame]:
             ts.run(settings)
         except PartialError as error:
             print(f"{street_of(log)}: {error}")
-        found = ts.dataset(settings.out)
+        found = dataset_of(settings.out)
         rows = found.rows.assign(street=street_of(log))
         if model is not None:
             rows = pd.concat([rows, said_by(model, settings, found)], axis=1)

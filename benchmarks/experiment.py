@@ -44,7 +44,7 @@ TITLES = {protocol.name: protocol.name for protocol in PROTOCOLS} | {
 
 def table_one_by_drive(run_dir: Path) -> str:
     """Shares of sample points beyond each limit, ours and the paper's, by drive."""
-    rows = ts.dataset(run_dir).rows
+    rows = ts.dataset(run_dir)
     lines = []
     for drive, part in rows.assign(drive=rows["group"].str.split("-").str[0]).groupby("drive"):
         lines += [[str(drive), *row] for row in table_one(part)]

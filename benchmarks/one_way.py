@@ -112,7 +112,7 @@ def measured(given: argparse.Namespace) -> pd.DataFrame:
             model={"recipe": "physics", "offset": 0.0},
         )
         ts.run(settings)
-        tables.append(ts.dataset(out).rows.assign(street=name))
+        tables.append(ts.dataset(out).assign(street=name))
     table = pd.concat(tables, ignore_index=True)
     table["lidar"] = table["group"].str.split(" ").str[0]
     square = np.floor(table[["x", "y"]] / BLOCK).astype(int).astype(str)

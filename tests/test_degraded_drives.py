@@ -11,6 +11,7 @@ from streets import job, street, write_drive
 import tilestream as ts
 from tilestream.factors.along_route import AVERAGED, WIDTH, averaged_along
 from tilestream.formats.points.pcd import write_pcd
+from tilestream.pipeline.jobs.run import dataset_of
 from tilestream.pipeline.jobs.run_findings import labels_of
 from tilestream.pipeline.jobs.run_inputs import degraded_drives, inputs_of, observing_of
 from tilestream.pipeline.jobs.run_plan import plan_measure
@@ -83,7 +84,7 @@ def test_it_sees_less(run: RunSettings) -> None:
 def test_its_labels_are_joined_with_that_and_the_estimate_is_of_the_vehicle(
     run: RunSettings,
 ) -> None:
-    rows = ts.dataset(run.folder).rows
+    rows = ts.dataset(run.folder)
     names = list(AVERAGED)
     for group in ("short", "whole"):
         mine = rows[rows["group"] == group].set_index("sample")
@@ -105,7 +106,7 @@ def test_no_estimate_of_the_vehicle_stands_beside_its_labels(
     run: RunSettings, offset: float | None
 ) -> None:
     places = pd.read_parquet(Path(run.out) / "report" / "places.parquet")
-    dataset = ts.dataset(run.folder)
+    dataset = dataset_of(run.folder)
     found = labels_of(dataset, places, None, run.spacing, ["short"], offset).set_index("group")
     short, whole = found.loc["short"], found.loc["whole"]
     if offset is None:  # a model that was trained elsewhere, for the vehicle

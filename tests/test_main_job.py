@@ -49,6 +49,7 @@ from tilestream.pipeline.engine.outputs import TileArrays
 from tilestream.pipeline.engine.stage import Task
 from tilestream.pipeline.jobs import run_story
 from tilestream.pipeline.jobs.forecast import forecast
+from tilestream.pipeline.jobs.run import dataset_of
 from tilestream.pipeline.jobs.run_book import Book
 from tilestream.pipeline.jobs.run_inputs import check_model, inputs_of, making_of
 from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
@@ -150,7 +151,7 @@ def test_every_sample_point_has_an_estimate_with_its_interval(done: tuple[Path, 
 
 
 def test_the_dataset_is_the_join_of_factors_and_errors(done: tuple[Path, Told]) -> None:
-    dataset = ts.dataset(done[0])
+    dataset = dataset_of(done[0])
     rows = dataset.rows
     assert len(rows) == len(STREETS) * SCANS
     assert dataset.losses == {}
@@ -285,14 +286,17 @@ def test_another_matcher_redoes_the_labels_and_what_is_learnt(inputs: Path, copy
     label = {"matcher": "autoware", "starts": {"radius": 0.4, "step": 0.2}}
     ts.run(job(inputs, copy, label=label), watch=told)
     assert told.worked() == {"register", "label", *LEARNT}
-    assert ts.dataset(copy).data_sets["canyon"]["registration"]["solver"] == "raw"
+    assert dataset_of(copy).data_sets["canyon"]["registration"]["solver"] == "raw"
 
 
 @pytest.mark.slow
 def test_a_drive_that_is_left_out_leaves_nothing_behind(inputs: Path, copy: Path) -> None:
     drives = [{"log": str(inputs / f"{kind}.mcap")} for kind in ("canyon", "tunnel")]
     ts.run(job(inputs, copy, drives=drives))
-    assert set(ts.dataset(copy).rows["group"]) == {"canyon", "tunnel"}
+    table = ts.dataset(copy)
+    assert set(table["group"]) == {"canyon", "tunnel"}
+    pd.testing.assert_frame_equal(table, dataset_of(copy).rows)
+    assert table.attrs["features"] == dataset_of(copy).names
     assert {p.name for p in (copy / "tables" / "errors").iterdir()} == {"canyon", "tunnel"}
     places = pd.read_parquet(copy / "report" / "places.parquet")
     assert set(places["route_id"]) == {"canyon", "tunnel"}
@@ -483,7 +487,7 @@ def test_observability_joins_the_factors(inputs: Path, copy: Path) -> None:
     ts.run(job(inputs, copy, observe={"range_max": 14.0}, model=model), watch=told)
     assert {"surfels", "observe"} <= {outcome.stage for outcome in told.outcomes}
     assert told.worked() == set(LEARNT)
-    dataset = ts.dataset(copy)
+    dataset = dataset_of(copy)
     assert len(dataset) == len(STREETS) * SCANS
     assert {"vd_mean", "ob_info_along", "feature_count"} <= set(dataset.names)
     found = json.loads((copy / "tables" / "evaluation.json").read_text())

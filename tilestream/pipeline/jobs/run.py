@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import yaml
 
 from tilestream.errors import PartialError
@@ -134,19 +135,32 @@ def _run(settings: RunSettings, client: Any | None, watch: Watch | None) -> None
         )
 
 
-def dataset(run_dir: str | os.PathLike[str]) -> Dataset:
-    """The factors and errors of the same places, as a run has joined them.
+def dataset(run_dir: str | os.PathLike[str]) -> pd.DataFrame:
+    """The factors and errors of the same places, as a run has joined them: for models of one's own.
 
     Args:
         run_dir: a run directory.
 
     Returns:
-        The dataset: `rows` (a pandas table: place, factors, labels), `columns` (the features),
-        `lost` (labels without a place, with reasons).
+        A row per labelled place and drive: `group` (log and sensor), `path`, `block`, `arc_length`
+        [m], `x`, `y`, `z` [m, map frame], `heading` [rad], the factors and the labels, each of them
+        explained by `ts.explain`. `attrs["features"]` names the factors that models learn from.
 
     Raises:
         SourceNotFoundError: no dataset there.
+
+    Examples:
+        >>> table = ts.dataset("my-run")  # doctest: +SKIP
+        >>> X, y = table[table.attrs["features"]], table["error_mean"]  # doctest: +SKIP
     """
+    found = dataset_of(run_dir)
+    table = found.rows.copy()
+    table.attrs["features"] = found.names
+    return table
+
+
+def dataset_of(run_dir: str | os.PathLike[str]) -> Dataset:
+    """The same with all that is known of it; raises as `dataset`."""
     return DatasetFile(f"{place_of(run_dir)}/tables/samples/dataset.parquet").read()
 
 
