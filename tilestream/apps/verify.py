@@ -109,7 +109,7 @@ def _wrong(path: str, read: Callable[[], object], *made_of: Any) -> Damage | Non
 
 
 def _store(url: str) -> Findings:
-    """The record of a store, its manifest, and every table of every tile."""
+    """The record of a store, its manifest, its shares, and every table of every tile."""
     try:
         store = open_store(url)
     except TilestreamError as error:
@@ -120,6 +120,7 @@ def _store(url: str) -> Findings:
     yield bad
     if bad is not None or store.manifest is None:
         return
+    yield _wrong(f"{url}, what each source gave", store.shares, sources, store.forget_shares)
     if store.state() != "whole":
         yield Damage(url, str(store.condition()))
     for key in store.manifest.identities:

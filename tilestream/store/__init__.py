@@ -44,10 +44,15 @@ from tilestream.store.arrays import (
     write_group,
 )
 from tilestream.store.condition import Condition as Condition
+from tilestream.store.manifest import PREFIX as MANIFEST
 from tilestream.store.manifest import Manifest as Manifest
-from tilestream.store.manifest import read_manifest, remove_other_manifests
+from tilestream.store.manifest import read_manifest
 from tilestream.store.record import Record, State, read_record, source_of, way_of, write_record
 from tilestream.store.record import StoreSettings as StoreSettings
+from tilestream.store.shares import PREFIX as SHARES
+from tilestream.store.shares import Share as Share
+from tilestream.store.shares import Shares as Shares
+from tilestream.store.shares import added as added
 from tilestream.store.table import CELLS_VERSION as CELLS_VERSION
 from tilestream.store.table import TileTable as TileTable
 from tilestream.store.table import cells_table as cells_table
@@ -253,7 +258,9 @@ class TileStore:
     def _write(self, record: Record) -> None:
         write_record(self.files, record)
         self.files.remove_parts()
-        remove_other_manifests(self.files, record.manifest)
+        for name in self.files.names():
+            if name.startswith((MANIFEST, SHARES)) and name not in (record.manifest, record.shares):
+                erase(self.files, name)
         self.__dict__.pop("manifest", None)  # the one that was read before
 
     def sources(self) -> list[dict[str, Any]]:
@@ -266,6 +273,16 @@ class TileStore:
     def made_by(self) -> dict[str, int]:
         """The stages that made the map, with their versions; empty until an ingest has ended."""
         return dict(read_record(self.url).made_by or {})
+
+    def shares(self) -> Shares | None:
+        """What each of `sources` gave to each tile; None: that is not known, as of a map that an
+        older version made.
+
+        Raises:
+            DamagedError: it was lost, or is not what was written.
+        """
+        name = read_record(self.url).shares
+        return None if name is None else Shares.read(self.files, name)
 
     @cached_property
     def manifest(self) -> Manifest | None:
@@ -286,18 +303,40 @@ class TileStore:
         name = manifest.write(self.files)
         self._write(replace(read_record(self.url), state="being written", manifest=name))
 
-    def end(self, sources: Sequence[Mapping[str, Any]], made_by: Mapping[str, int]) -> None:
-        """Record what the map was made from, and by which versions of the stages.
+    def end(
+        self,
+        sources: Sequence[Mapping[str, Any]],
+        made_by: Mapping[str, int],
+        shares: Shares | None = None,
+    ) -> None:
+        """Record what the map was made from, by which versions of the stages, and what each of the
+        sources gave to each tile; None: what it says of that stays.
 
         A map whose tiles were never known is not whole by that.
         """
         known = [{**source, "way": way_of(self.files, source["path"])} for source in sources]
         record = replace(read_record(self.url), sources=known, made_by=made_by)
+        if shares is not None:
+            record = replace(record, shares=shares.write(self.files))
         self._write(record if record.manifest is None else replace(record, state="whole"))
 
     def forget(self) -> None:
         """Say that it is not known which tiles the map must have: its ingest finds out again."""
         self._write(replace(read_record(self.url), state="being written", manifest=None))
+
+    def forget_shares(self) -> None:
+        """Say that it is not known what each source gave to each tile: the next update reads all
+        of them.
+        """
+        self._write(replace(read_record(self.url), shares=None))
+
+    def written(self, keys: Iterable[TileKey]) -> dict[TileKey, Mark]:
+        """The marks of the points of those of some tiles that are done, of whichever map, also of
+        one that an interrupted update has left.
+        """
+        wanted = list(keys)
+        marks = read_marks(self.files, [f"{key}/{POINTS}" for key in wanted])
+        return {k: mark for k, mark in zip(wanted, marks, strict=True) if mark.status == "done"}
 
     def remove(self, key: TileKey) -> None:
         """Remove a tile with all its tables; the mark of its points goes first."""

@@ -63,10 +63,3 @@ def read_manifest(files: Files, name: str) -> Manifest:
     identities = [bytes(row).rstrip(b"\0").decode() for row in columns["identity"]]
     points = columns["points"].tolist()
     return Manifest(dict(zip(keys, identities, strict=True)), dict(zip(keys, points, strict=True)))
-
-
-def remove_other_manifests(files: Files, kept: str | None) -> None:
-    """Remove the manifests that a store has had before."""
-    for name in files.names():
-        if name.startswith(PREFIX) and name != kept:
-            erase(files, name)

@@ -49,6 +49,8 @@ class Record:
     """What the map was made from."""
     made_by: Mapping[str, int] | None = None
     """The stages that made it, with their versions; None: no ingest has ended."""
+    shares: str | None = None
+    """Name in the store of what each source gave to each tile; None: that is not known."""
 
 
 def way_of(files: Files, path: str) -> str | None:

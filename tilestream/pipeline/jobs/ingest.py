@@ -2,13 +2,12 @@
 
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
 from tilestream.crs import same
 from tilestream.errors import (
-    CorruptSourceError,
     PartialError,
     SourceError,
     StoreNotFoundError,
@@ -16,33 +15,12 @@ from tilestream.errors import (
 )
 from tilestream.formats.logs import ScanSelection
 from tilestream.lock import only_writer
-from tilestream.notes import noticed
-from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.executor import Watch, execute
-from tilestream.pipeline.engine.outputs import TileArrays
-from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan
-from tilestream.pipeline.engine.stage import Task
-from tilestream.pipeline.jobs.sources import (
-    Source,
-    as_read,
-    examine_all,
-    with_crs,
-    within,
-)
-from tilestream.pipeline.jobs.strays import without_strays
-from tilestream.pipeline.stages.merge import merge, merge_tasks
-from tilestream.pipeline.stages.scatter import (
-    Fragment,
-    SourceSpan,
-    fragments_of,
-    scatter,
-    scatter_tasks,
-)
+from tilestream.pipeline.engine.plan import DEFAULT_MEMORY
+from tilestream.pipeline.jobs.map_reading import MADE_BY, Reading, remembered
+from tilestream.pipeline.jobs.sources import Source, examine_all, with_crs, within
 from tilestream.settings import IngestSettings, LogOptions
-from tilestream.store import Manifest, StoreSettings, TileStore, open_store
-
-MADE_BY = {stage.name: stage.version for stage in (scatter, merge)}
-"""What a map is made by: another version makes it anew."""
+from tilestream.store import StoreSettings, TileStore, open_store
 
 
 def ingest(
@@ -63,12 +41,15 @@ def ingest(
     """Make a tile store from point clouds, map directories and logs of drives.
 
     Sources are read in blocks, scattered to tile fragments, and each tile is merged and thinned by
-    one task, within the promised memory. A killed ingest continues where it was when called again;
-    a changed source redoes the tiles that it touches; unchanged tiles are kept.
+    one task, within the promised memory. A killed ingest continues where it was when called again.
+    Of a map that is there only what an update reaches is made again: a source that is new, has
+    changed or was taken away is read (what it gave is known), and of the others what they give to
+    the tiles that differ; all other tiles stay as they are.
 
     Args:
         sources: files, globs and Autoware map directories, mixed: PCD, LAS, LAZ, PLY, E57, logs.
-            They are the whole map: a source that the store knows must be given again.
+            They are the whole map: a source that the store knows must be given again, as long as
+            it is there.
         url: the store, a local path or any fsspec URL.
         tile_size: edge of a tile [m].
         halo: what tasks read around a tile [m].
@@ -119,133 +100,6 @@ def ingest(
     return reading.store
 
 
-class Reading:
-    """A map in the making: its sources are read first, then it is known which tiles it has."""
-
-    def __init__(
-        self, store: TileStore, found: Sequence[Source], memory: int, current: bool
-    ) -> None:
-        """Sources, opened as far as their headers.
-
-        Args:
-            store: where the tiles go.
-            found: the sources.
-            memory: what a task may use [bytes].
-            current: whether the store is whole and made from these sources: nothing is left to do.
-        """
-        self.store = store
-        self.found = list(found)
-        self.merges: tuple[Task, ...] = ()
-        """The tasks that write tiles, once all sources are read."""
-        self._memory = memory
-        self._current = current
-        readable = [(s.info, s.spans, s.state, s.options) for s in found if s.info is not None]
-        self.scatters = Plan((), memory) if current else scatter_tasks(store, readable, memory)
-        """The tasks that read the sources."""
-        spans = {task.key: task.reads["blocks"] for task in self.scatters.tasks}
-        self._open = {key: span.path for key, span in spans.items() if isinstance(span, SourceSpan)}
-        self._read: dict[str, list[Outcome]] = {source.path: [] for source in found}
-
-    @property
-    def left_out(self) -> dict[str, str]:
-        """The sources that could not be opened, and why."""
-        return {source.path: source.reason for source in self.found if source.reason}
-
-    @property
-    def notes(self) -> dict[str, list[str]]:
-        """What the headers of the sources tell, by source."""
-        return noticed({one.path: one.info.notes for one in self.found if one.info is not None})
-
-    def first(self) -> Plan:
-        """What to run first: the tasks that read the sources.
-
-        Raises:
-            PartialError: none can be read; the map stays as it was.
-        """
-        if not self._current and not self.scatters.tasks:
-            self._sorted_out()
-        return self.scatters
-
-    def grown(self, outcome: Outcome) -> tuple[Task, ...] | None:
-        """The tasks that write the tiles, as soon as the last source is read; else None.
-
-        Raises:
-            PartialError: no source could be read; the map stays as it was.
-        """
-        path = self._open.pop(outcome.key, None)
-        if path is None:
-            return None
-        self._read[path].append(outcome)
-        return None if self._open else self._sorted_out()
-
-    def _sorted_out(self) -> tuple[Task, ...]:
-        fragments: list[Fragment] = []
-        for number, source in enumerate(self.found):
-            parts = self._read[source.path]
-            failed = [outcome.reason for outcome in parts if not outcome.ok]
-            if failed:
-                self.found[number] = replace(source, reason=failed[0])
-            elif not source.reason:
-                indices = [Fragment.of(outcome.facts) for outcome in parts]
-                try:
-                    kept = without_strays(source.path, indices, self.store.grid)
-                except CorruptSourceError as error:
-                    self.found[number] = replace(source, reason=str(error))
-                    continue
-                self.found[number] = as_read(source, indices, kept)
-                fragments += kept.fragments
-        fragments.sort(key=lambda fragment: [int(part) for part in fragment.name.split("-")])
-        self.merges = merge_tasks(self.store, fragments, self._memory).tasks
-        failures = self._unread()
-        if failures and not self.merges:
-            self._record()
-            raise PartialError(
-                f"{self.store.url}: no source could be read, the map is as it was:", failures
-            )
-        self.store.begin(
-            Manifest.of(
-                {
-                    t.tile: (t.identity, t.counts["points"])
-                    for t in self.merges
-                    if t.tile is not None
-                }
-            )
-        )
-        return self.merges
-
-    def _unread(self) -> dict[str, str]:
-        return {source.path: source.reason for source in self.found if source.reason}
-
-    def close(self, outcomes: Sequence[Outcome]) -> dict[str, str]:
-        """Record what was made; what failed, with its reason.
-
-        Args:
-            outcomes: of the tasks that write tiles, others besides.
-
-        Raises:
-            SourceError: the sources hold no points.
-        """
-        if self._current:
-            return {}
-        ended = {outcome.key: outcome for outcome in outcomes}
-        failed = {task.key: ended[task.key].reason for task in self.merges if task.key in ended}
-        failed = {key: reason for key, reason in failed.items() if reason}
-        fragments_of(self.store.url).remove()  # first, since a full disk may need the room
-        for task in self.merges:
-            if task.key in failed and isinstance(task.writes, TileArrays):
-                task.writes.refuse(failed[task.key], task.identity)
-        self._record()
-        failures = self._unread() | failed
-        if not self.merges and not failures:
-            sources = ", ".join(source.path for source in self.found)
-            raise SourceError(f"{self.store.url}: the sources hold no points: {sources}")
-        return failures
-
-    def _record(self) -> None:
-        fragments_of(self.store.url).remove()
-        self.store.end([source.record for source in self.found], MADE_BY)
-
-
 def read_sources(
     sources: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
     url: str | os.PathLike[str],
@@ -261,7 +115,8 @@ def read_sources(
     recorded = _recorded(store, found)
     if current and recorded != store.sources():
         store.end(recorded, MADE_BY)  # the sources have moved, or have other names now
-    return Reading(store, found, memory, current)
+    as_before = {} if current else remembered(store, found, recorded)
+    return Reading(store, found, memory, current=current, remembered=as_before)
 
 
 def store_settings(settings: IngestSettings) -> StoreSettings:
@@ -287,14 +142,14 @@ def plan_ingest(
     if all(source.reason for source in found):
         raise SourceError(found[0].reason)
     store = TileStore(str(url), store_settings(with_crs(settings, found)))
-    return Reading(store, found, memory, current=False)
+    return Reading(store, found, memory)
 
 
 def _create_or_resume(url: str, settings: IngestSettings, found: Sequence[Source]) -> TileStore:
     """The store to write to: a new one, or the one that is there if it is the same map.
 
     Raises:
-        UsageError: the store has other settings, or knows a source that was not given.
+        UsageError: the store has other settings, or knows a source that is there and was not given.
     """
     wanted = store_settings(settings)
     try:
@@ -309,11 +164,12 @@ def _create_or_resume(url: str, settings: IngestSettings, found: Sequence[Source
                 "use the same setting, or another path for the new store"
             )
     given = {source.path for source in found}
-    forgotten = sorted({s["path"] for s in _recorded(store, found)} - given)
+    absent = sorted({s["path"] for s in _recorded(store, found)} - given)
+    forgotten = [path for path in absent if Path(path).exists()]
     if forgotten:
         raise UsageError(
-            f"{url} was also made from {', '.join(forgotten)}: give all sources of the map, "
-            "or another path for the new store"
+            f"{url} was also made from {', '.join(forgotten)}: give all sources of the map, move "
+            "away what is no part of it any more, or give another path for the new store"
         )
     return store
 

@@ -17,7 +17,8 @@ from tilestream.model.shipped import file_of
 from tilestream.model.training import check_making
 from tilestream.notes import Notes, noticed
 from tilestream.pipeline.engine.executor import Watch
-from tilestream.pipeline.jobs.ingest import Reading, read_sources
+from tilestream.pipeline.jobs.ingest import read_sources
+from tilestream.pipeline.jobs.map_reading import Reading
 from tilestream.pipeline.jobs.run_routes import routes_in, routes_of_map
 from tilestream.pipeline.jobs.run_settings import RunSettings, one_of_each
 from tilestream.pipeline.jobs.simulate import simulate

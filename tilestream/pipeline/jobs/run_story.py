@@ -11,8 +11,8 @@ from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.plan import Plan, paths_of
 from tilestream.pipeline.engine.stage import Task
 from tilestream.pipeline.jobs.estimator import LABELS, Estimator, estimator_of
-from tilestream.pipeline.jobs.ingest import Reading
 from tilestream.pipeline.jobs.inventory import announce, withdraw
+from tilestream.pipeline.jobs.map_reading import Reading
 from tilestream.pipeline.jobs.run_book import Book
 from tilestream.pipeline.jobs.run_inputs import Inputs, read_map
 from tilestream.pipeline.jobs.run_notes import with_logs
@@ -65,12 +65,14 @@ class Story:
 
     def grown(self, outcome: Outcome) -> tuple[Task, ...]:
         """What is to be done now that a task has ended."""
-        merges = self.reading.grown(outcome) if self.reading else None
-        if merges is not None:
-            self._tiles = {task.key for task in merges}
-            if not merges:
+        more = self.reading.grown(outcome) if self.reading else None
+        if self.reading is not None and more is not None:
+            if self.reading.changes is None:  # what else is to be read of the tiles that differ
+                return self._known(more)
+            self._tiles = {task.key for task in more}
+            if not more:
                 self._close_map()  # which refuses sources without points
-            return self._known((*merges, *self._measured(MapPlan.of_merges(self.store, merges))))
+            return self._known((*more, *self._measured(self.reading.map_plan)))
         if outcome.key in self._tiles:
             self._tiles.remove(outcome.key)
             if not self._tiles:

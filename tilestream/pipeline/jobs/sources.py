@@ -1,7 +1,7 @@
 """The sources of a map: each opened as far as its header, and what became of it."""
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,8 @@ class Source:
     """Points that were not finite."""
     scans: str = ""
     """The scans of a log that become map points (`overlap.packed`)."""
+    told: tuple[str, ...] = ()
+    """What was noticed as it was read, beyond its header."""
     reason: str = ""
     """Why it failed; empty where it did not."""
 
@@ -61,7 +63,8 @@ class Source:
             "size_bytes": info.size_bytes if info else 0,
             "crs": info.crs if info else None,
             "contents": list(info.contents) if info else [],
-            "notes": list(info.notes) if info else [],
+            "notes": [*(info.notes if info else ()), *self.told],
+            "told": list(self.told),
             "scans": self.scans,
             "points": self.points,
             "dropped": self.dropped,
@@ -164,14 +167,18 @@ def with_crs(settings: IngestSettings, found: Sequence[Source]) -> IngestSetting
 def as_read(source: Source, indices: Sequence[Fragment], kept: Kept) -> Source:
     """A source with what was read of it, and what was left out."""
     left_out = sum(index.left_out for index in indices)
-    notes = kept.notes
+    told = kept.notes
     if left_out:
-        told = "points of a class of noise (7 or 18) or withheld are left out"
-        notes += (f"{left_out:,} {told}; --keep-noise keeps them",)
-    assert source.info is not None
-    info = replace(source.info, notes=(*source.info.notes, *notes))
+        why = "points of a class of noise (7 or 18) or withheld are left out"
+        told += (f"{left_out:,} {why}; --keep-noise keeps them",)
     dropped = sum(index.dropped for index in indices)
-    return replace(source, info=info, points=kept.points, dropped=dropped)
+    return replace(source, told=told, points=kept.points, dropped=dropped)
+
+
+def as_remembered(source: Source, record: Mapping[str, Any]) -> Source:
+    """A source that is as it was, with what a store has recorded as it was read."""
+    told = tuple(record["told"])
+    return replace(source, told=told, points=record["points"], dropped=record["dropped"])
 
 
 def map_notes(store: TileStore) -> dict[str, list[str]]:

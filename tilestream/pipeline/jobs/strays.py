@@ -5,7 +5,7 @@ Told by the tiles of a whole source, so that they are the same however it is rea
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -72,7 +72,7 @@ def without_strays(path: str, fragments: Sequence[Fragment], grid: TileGrid) -> 
         if not _are_few(lost, points):
             raise CorruptSourceError(f"{path}: {told}: remove them, or give one area in a file")
         notes.append(f"{told}: left out")
-        fragments = [_without(fragment, strays) for fragment in fragments]
+        fragments = [fragment.only(counts.keys() - strays) for fragment in fragments]
         points -= lost
     return Kept(tuple(fragments), points, tuple(notes))
 
@@ -113,11 +113,3 @@ def _parts(cells: Int64) -> Int64:
 
 def _place(corner: np.ndarray) -> str:
     return f"({corner[0]:.0f}, {corner[1]:.0f})"
-
-
-def _without(fragment: Fragment, strays: set[tuple[int, int]]) -> Fragment:
-    return replace(
-        fragment,
-        pieces=tuple(piece for piece in fragment.pieces if piece[:2] not in strays),
-        prints=tuple(row for row in fragment.prints if row[:2] not in strays),
-    )

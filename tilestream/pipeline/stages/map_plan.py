@@ -9,7 +9,7 @@ from tilestream.factors.surfels import surfel_mm, surfels_table
 from tilestream.factors.terms import terms_table
 from tilestream.from_above import above_table
 from tilestream.grid import Box, TileKey
-from tilestream.marks import hash_of
+from tilestream.marks import Mark, hash_of
 from tilestream.pipeline.engine.outputs import TileArrays
 from tilestream.pipeline.engine.stage import Stage, Task
 from tilestream.pipeline.stages.above import above
@@ -78,16 +78,17 @@ class MapPlan:
         if not partial:
             condition.require_whole()
         done = {key: mark for key, mark in condition.marks.items() if mark.status == "done"}
-        return cls(
-            store, {k: TilePoints(m.identity, "", m.facts["points"]) for k, m in done.items()}
-        )
+        return cls.of_merges(store, (), done)
 
     @classmethod
-    def of_merges(cls, store: TileStore, merges: Iterable[Task]) -> "MapPlan":
-        """A map whose tiles are merged by these tasks."""
+    def of_merges(
+        cls, store: TileStore, merges: Iterable[Task], written: Mapping[TileKey, Mark]
+    ) -> "MapPlan":
+        """A map some of whose tiles are merged by these tasks; the others are written."""
         area = (store.settings.tile_size) ** 2
         most = EXPECTED_DENSITY * area if store.settings.map_leaf else float("inf")
-        points = {
+        points = {k: TilePoints(m.identity, "", m.facts["points"]) for k, m in written.items()}
+        points |= {
             task.tile: TilePoints(task.identity, task.key, int(min(task.counts["points"], most)))
             for task in merges
             if task.tile is not None

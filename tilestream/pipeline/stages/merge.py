@@ -1,7 +1,7 @@
 """Merge: gather the points of a tile from all fragments, thin them, write the tile."""
 
 import itertools
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,11 +13,10 @@ from tilestream.kernels import scatter as kernels
 from tilestream.kernels import thinning
 from tilestream.marks import hash_of
 from tilestream.pipeline.engine.outputs import Made, TileArrays
-from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.engine.stage import BASE_BYTES, Counts, Task, stage
-from tilestream.pipeline.stages.scatter import Fragment, Int32, Print, add_prints, fragments_of
+from tilestream.pipeline.stages.scatter import Fragment, Int32, Print, fragments_of
 from tilestream.records import Int64
-from tilestream.store import POINTS, TileStore
+from tilestream.store import POINTS, Share, TileStore
 
 BATCH_POINTS = 500_000
 """Points that are read at a time."""
@@ -53,15 +52,13 @@ class Pieces:
 
     store_url: str
     pieces: tuple[Piece, ...]
+    """Where they lie: all of them, of a tile that is to be merged."""
+    count: int
+    """Number of points."""
     fingerprint: Print
     strips: int
     """Into how many strips along x the tile is cut, one in memory at a time; changes no result."""
     makers: tuple[str, ...] = ()
-
-    @property
-    def count(self) -> int:
-        """Number of points."""
-        return sum(piece.count for piece in self.pieces)
 
     @property
     def identity(self) -> str:
@@ -160,41 +157,42 @@ def merge(pieces: Pieces, grid: TileGrid, tile: TileKey, map_leaf: float) -> Mad
     return Made({"xyz": xyz}, facts)
 
 
-def merge_tasks(store: TileStore, fragments: Iterable[Fragment], memory: int) -> Plan:
-    """The writing half of an ingest: one task per tile that holds a point.
+def merge_tasks(
+    store: TileStore,
+    totals: Mapping[TileKey, Share],
+    fragments: Iterable[Fragment],
+    memory: int,
+) -> list[Task]:
+    """The writing half of an ingest: a task for each tile that holds a point, sorted.
 
     Args:
         store: where the tiles go.
-        fragments: the indices of all fragments of sources that were read whole.
+        totals: the points of each tile.
+        fragments: the indices of the fragments that are there; those of tiles that are written and
+            have not changed may be absent.
         memory: what a task may use [bytes].
-
-    Raises:
-        PlanError: a tile does not fit the memory, not even strip by strip.
     """
-    pieces: dict[TileKey, list[Piece]] = {}
-    prints: dict[TileKey, Print] = {}
+    pieces: dict[TileKey, list[Piece]] = {key: [] for key in sorted(totals)}
     for fragment in fragments:
         for ix, iy, start, count in fragment.pieces:
-            pieces.setdefault(TileKey(ix, iy), []).append(Piece(fragment.name, start, count))
-        for ix, iy, a, b in fragment.prints:
-            key = TileKey(ix, iy)
-            prints[key] = add_prints(prints.get(key, (0, 0)), (a, b))
+            pieces[TileKey(ix, iy)].append(Piece(fragment.name, start, count))
     tasks = []
-    for key in sorted(pieces):
-        points = sum(piece.count for piece in pieces[key])
+    for key, there in pieces.items():
+        points, *fingerprint = totals[key]
         strips = strips_fitting(points, memory - BASE_BYTES)
+        read = Pieces(store.url, tuple(there), points, (fingerprint[0], fingerprint[1]), strips)
         tasks.append(
             Task(
                 merge,
                 str(key),
                 TileArrays(store.url, key, POINTS),
                 takes={"grid": store.grid, "tile": key, "map_leaf": store.settings.map_leaf},
-                reads={"pieces": Pieces(store.url, tuple(pieces[key]), prints[key], strips)},
+                reads={"pieces": read},
                 counts={"points": points, "strips": strips},
                 tile=key,
             )
         )
-    return Plan.of(tasks, memory)
+    return tasks
 
 
 def thin(points: Int32, leaf: int, origin: Int64) -> Int32:

@@ -6,9 +6,10 @@ workers.
 
 import json
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections import Counter
+from collections.abc import Container, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ from tilestream.pipeline.engine.outputs import Facts, Made
 from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.engine.stage import BASE_BYTES, Counts, Task, stage
 from tilestream.records import Float64, Int64
-from tilestream.store import TileStore
+from tilestream.store import Share, TileStore
 
 Int32 = NDArray[np.int32]
 Print = tuple[int, int]
@@ -111,6 +112,22 @@ class Fragment:
     """Points that do not fit the tile grid."""
     outside_at: tuple[float, ...] = ()
     """The first of those [m]."""
+
+    @property
+    def shares(self) -> dict[TileKey, Share]:
+        """What each tile has of it."""
+        counts: Counter[tuple[int, int]] = Counter()
+        for ix, iy, _, count in self.pieces:
+            counts[ix, iy] += count
+        return {TileKey(ix, iy): (counts[ix, iy], a, b) for ix, iy, a, b in self.prints}
+
+    def only(self, tiles: Container[tuple[int, int]]) -> Self:
+        """The same without what is of other tiles."""
+        return replace(
+            self,
+            pieces=tuple(piece for piece in self.pieces if piece[:2] in tiles),
+            prints=tuple(row for row in self.prints if row[:2] in tiles),
+        )
 
     @classmethod
     def of(cls, facts: Facts) -> "Fragment":
