@@ -41,7 +41,7 @@ from tilestream.pipeline.stages.label import label
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.observe import observe_drive
 from tilestream.pipeline.stages.predict import predict
-from tilestream.pipeline.stages.samples import COLUMNS, DatasetFile, samples
+from tilestream.pipeline.stages.samples import COLUMNS, DatasetFile, PlacesOf, samples
 from tilestream.pipeline.stages.train import ModelFile, ModelInUse, train
 from tilestream.report.data import BESIDE
 from tilestream.settings import DriveSettings
@@ -234,7 +234,7 @@ def _samples(
             "groups": {name: tuple(map(_group, tasks)) for name, tasks in parts.items()},
             "making": making_of(settings),
         },
-        reads={"routes": _products(routes)}
+        reads={"routes": tuple(PlacesOf(t.product, t.takes["samples"]) for t in routes)}
         | {name: _products(tasks) for name, tasks in parts.items()},
         work=sum(task.work for task in labels),
         counts={"places": sum(task.work for task in (*routes, *of_drives, *labels))},

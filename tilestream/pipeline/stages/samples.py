@@ -12,14 +12,14 @@ from tilestream.errors import DamagedError, SourceNotFoundError
 from tilestream.factors import catalogue, observability
 from tilestream.factors.along_route import AVERAGED, averaged_along
 from tilestream.factors.own import OWN, columns_in
-from tilestream.factors.rows import PLACE_COLUMNS, STATUS_COLUMNS
+from tilestream.factors.rows import PLACE_COLUMNS, STATUS_COLUMNS, Samples
 from tilestream.factors.virtual_drive import MOMENT_COLUMNS
-from tilestream.marks import Mark
+from tilestream.marks import Mark, hash_of
 from tilestream.model.dataset import VIRTUAL_DRIVES, Dataset
 from tilestream.model.features import features_of
 from tilestream.model.join import join
 from tilestream.pipeline.engine.outputs import Facts, Made, Parquet, Stored
-from tilestream.pipeline.engine.stage import stage
+from tilestream.pipeline.engine.stage import Counts, Product, stage
 from tilestream.pipeline.stages.factors import factors_drive
 from tilestream.pipeline.stages.label import ERROR_COLUMNS, label
 from tilestream.pipeline.stages.observe import observe_drive
@@ -135,6 +135,36 @@ def _dataset(file: DatasetFile, identity: str) -> Dataset:  # noqa: ARG001 - ano
     rows = read_tables([file.path])
     stages = facts.get("stages", {})  # those of older versions do not say it
     return Dataset(rows, columns, lost, facts["made_with"], facts["data_sets"], seen, stages)
+
+
+@dataclass(frozen=True)
+class PlacesOf:
+    """The sample points that a table is about: other than its factors, they are the same whatever
+    the map, so that a map that changes far from every drive changes no dataset, and no model.
+    """
+
+    table: Product
+    samples: Samples
+
+    @property
+    def identity(self) -> str:
+        """Hash of the sample points."""
+        return hash_of(self.samples)
+
+    @property
+    def makers(self) -> tuple[str, ...]:
+        """As of the table."""
+        return self.table.makers
+
+    def read(self) -> Stored:
+        """The places along their routes; heights are those of the map, and not known here."""
+        stored: Stored = self.table.read()
+        names = [column.name for column in PLACE_COLUMNS]
+        return Stored(stored.rows[names].assign(z=np.nan), {})
+
+    def counts(self) -> Counts:
+        """Nothing that memory depends on."""
+        return {}
 
 
 MAKERS = (factors_drive, observe_drive, register, label)
