@@ -31,7 +31,7 @@ from tilestream.files import Files, place_of
 from tilestream.model.join import ON_PATH
 from tilestream.model.training import ESTIMATES, MAIN, PREDICTION_COLUMNS
 from tilestream.notebook import axes_of, html_of
-from tilestream.pipeline.jobs.run_book import RECORD, told_before
+from tilestream.pipeline.jobs.run_book import ENDED, RECORD, told_before
 from tilestream.pipeline.jobs.run_folder import map_of, rows_of, table_paths
 from tilestream.pipeline.jobs.run_inputs import seen_otherwise
 from tilestream.pipeline.jobs.run_settings import RunSettings
@@ -49,8 +49,6 @@ MEASURED = {
 }
 """Name of each label beside the estimate of the same."""
 OF_LABEL = ["drive", *MEASURED.values(), "measured_distance"]
-ENDED = ("done", "failed")
-"""What a run says of itself whose report is of its tables."""
 
 
 def read_run(place: str | os.PathLike[str]) -> pd.DataFrame:

@@ -30,6 +30,7 @@ from tilestream.pipeline.engine.costs import learn
 from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.jobs.estimator import Estimator
 from tilestream.pipeline.jobs.inventory import settle
+from tilestream.pipeline.jobs.run_before import tell
 from tilestream.pipeline.jobs.run_book import (
     RECORD,
     Book,
@@ -71,7 +72,8 @@ def run(
     `observability`, `starts`, `errors`, `samples`, `judged`, `predictions`), `model.skops`,
     `report/` (`index.html` and its data), `config.yaml` (the effective one), `run.json` (versions,
     times over all calls, counts, failures). A job that was killed continues when it is called
-    again; what changed is redone with what depends on it.
+    again; what changed is redone with what depends on it. Where the map was updated, what the
+    report said before it is kept in `before/` (`ts.diff(run_dir)`).
 
     Args:
         config: the settings, or a YAML file of them.
@@ -125,8 +127,11 @@ def _run(settings: RunSettings, client: Any | None, watch: Watch | None) -> None
         settle(book.tasks, book.failures)
         book.facts["notes"] = run_notes(settings, inputs, story.store)
         _report(settings, inputs, story, book)
+    if story.update is not None:
+        made = book.stages().get("predict", {"made": 0})["made"]
+        book.facts["update"] = story.update.facts(int(made), story.places)
     book.facts["files"] = checksums(settings.folder)
-    for name in ("", "tables", "report", "report/figures"):
+    for name in ("", "tables", "report", "report/figures", "before"):
         settings.folder.under(name).remove_parts()
     book.write("failed" if book.failures else "done")
     if book.failures:
@@ -209,6 +214,7 @@ def _report(settings: RunSettings, inputs: Inputs, story: Story, book: Book) -> 
     text = json.dumps(plain(evaluation), indent=1, allow_nan=False)
     write_text(settings.folder.under("tables/evaluation.json"), text + "\n")
     write_report(found, f"{settings.out}/report", threshold=settings.report.threshold)
+    tell(settings, story.map_plan)
     book.facts["report"] = f"{settings.out}/report/index.html"
 
 

@@ -24,6 +24,8 @@ from tilestream.version import VERSION
 
 RECORD = "run.json"
 """The file of the record."""
+ENDED = ("done", "failed")
+"""What a run says of itself whose report is of its tables."""
 WRITE_EVERY = 30.0
 """How often `run.json` is written while tasks end [s]."""
 
@@ -102,13 +104,18 @@ class Book:
         return round(before + time.time() - self.began, 1)
 
     def stages(self) -> dict[str, dict[str, float]]:
-        """Tasks, failures and work of each stage in this call; its core-seconds in all calls."""
+        """Tasks, failures and work of each stage in this call, and how much of the work was made by
+        it and by those before it that did not end: the rest was done; core-seconds of all calls.
+        """
         work = {task.key: task.work for task in self.tasks}
-        nothing = {"tasks": 0, "failed": 0, "work": 0, "core_seconds": 0.0}
+        nothing = {"tasks": 0, "failed": 0, "work": 0, "made": 0, "core_seconds": 0.0}
         before: dict[str, Any] = self.earlier.get("stages", {})
+        ended = self.earlier.get("state") in ENDED
         order = dict.fromkeys([*before, *(task.stage for task in self.tasks)])
         table = {
-            stage: nothing | {"core_seconds": before.get(stage, nothing)["core_seconds"]}
+            stage: nothing
+            | {"core_seconds": before.get(stage, nothing)["core_seconds"]}
+            | {"made": 0 if ended else before.get(stage, nothing).get("made", 0)}
             for stage in order
         }
         for outcome in self.outcomes:
@@ -116,6 +123,7 @@ class Book:
             row["tasks"] += 1
             row["failed"] += not outcome.ok
             row["work"] += work[outcome.key]
+            row["made"] += work[outcome.key] if outcome.made else 0
             row["core_seconds"] = round(row["core_seconds"] + outcome.seconds, 3)
         return table
 
@@ -131,7 +139,8 @@ def told_before(record: Files) -> dict[str, Any]:
 def checksums(folder: Files) -> dict[str, str]:
     """The checksums of what a run writes besides its tables, by path in the run directory."""
     names = ["config.yaml", "model.skops", "tables/evaluation.json"]
-    names += [f"report/{name}" for name in folder.under("report").all_files()]
+    for below in ("report", "before"):
+        names += [f"{below}/{name}" for name in folder.under(below).all_files()]
     return {name: checksum_of(folder.under(name)) for name in names if folder.under(name).there()}
 
 

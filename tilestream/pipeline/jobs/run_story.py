@@ -13,6 +13,7 @@ from tilestream.pipeline.engine.stage import Task
 from tilestream.pipeline.jobs.estimator import LABELS, Estimator, estimator_of
 from tilestream.pipeline.jobs.inventory import announce, withdraw
 from tilestream.pipeline.jobs.map_reading import Reading
+from tilestream.pipeline.jobs.run_before import Update, keep_before, update_of
 from tilestream.pipeline.jobs.run_book import Book
 from tilestream.pipeline.jobs.run_inputs import Inputs, read_map
 from tilestream.pipeline.jobs.run_notes import with_logs
@@ -45,6 +46,10 @@ class Story:
         self.measure = Plan((), settings.memory)
         self.estimator = Estimator()
         """What makes the estimates, as far as it is known by now."""
+        self.map_plan = MapPlan(self.store, {})
+        """The map, as soon as its tiles are known."""
+        self.update: Update | None = None
+        """What is new in it since the last report, by then; None: nothing, or none was there."""
         self.large: Plan | None = None
         """What is left to be run by all workers together, when all else is done."""
         self._tiles: set[str] = set()
@@ -53,6 +58,11 @@ class Story:
         self._given: set[str] = set()
         self._joining: str | None = None
         self._all_planned = False
+
+    @property
+    def places(self) -> int:
+        """How many sample points the routes have."""
+        return sum(task.work for task in self.measure.outputs("factors"))
 
     def first(self) -> Plan:
         """What to run first: read the sources, or measure on the map that is there."""
@@ -131,7 +141,12 @@ class Story:
             self.book.failures |= self.reading.close(self.book.outcomes)
 
     def _measured(self, map_plan: MapPlan) -> tuple[Task, ...]:
-        """The tasks that measure; tables of other settings are removed before."""
+        """The tasks that measure; tables of other settings are removed before, and what the last
+        report says of another map is kept.
+        """
+        self.map_plan, self.update = map_plan, update_of(self.settings, map_plan)
+        if self.update is not None:
+            keep_before(self.settings)
         self.measure = plan_measure(self.settings, self.inputs, map_plan)
         self.book.failures |= self.measure.left_out
         announce(self.measure.tasks)

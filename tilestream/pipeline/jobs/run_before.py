@@ -1,0 +1,167 @@
+"""What a run was before its map was updated: kept beside what it is now.
+
+```
+report/places.parquet, report/tiles.json   of the last call that ended
+before/places.parquet, before/tiles.json   the same, of before the last update of the map
+```
+"""
+
+import io
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import pandas as pd
+
+from tilestream.errors import DamagedError, UsageError
+from tilestream.files import Files
+from tilestream.grid import TileKey
+from tilestream.marks import AGAIN, hash_of, sealed, unsealed
+from tilestream.pipeline.jobs.run_book import checksum_of, write_text
+from tilestream.pipeline.jobs.run_inputs import making_of
+from tilestream.pipeline.jobs.run_settings import RunSettings
+from tilestream.pipeline.stages.map_plan import MapPlan
+
+REPORT, BEFORE = "report", "before"
+"""The folders of what is, and of what was."""
+PLACES, TILES = "places.parquet", "tiles.json"
+
+
+@dataclass(frozen=True)
+class Told:
+    """The map that a report is of."""
+
+    tile_size: float
+    """Edge of its tiles [m]."""
+    crs: str | None
+    """Its CRS; None: a local frame."""
+    tiles: Mapping[str, str]
+    """The identity of the points of each tile, by name."""
+    settings: str
+    """Hash of the settings that decide the estimates."""
+    places: str
+    """Checksum of the file of places beside it."""
+
+    @property
+    def keys(self) -> dict[TileKey, str]:
+        """The identities by tile."""
+        return {TileKey.parse(name): identity for name, identity in self.tiles.items()}
+
+
+@dataclass(frozen=True)
+class Update:
+    """Which tiles of a map are others than those of the last report."""
+
+    changed: int
+    """That are new, or whose points are others."""
+    removed: int
+    """That the map has no more."""
+    of: int
+    """How many tiles the map has."""
+
+    def facts(self, made: int, places: int, at_most: bool = False) -> dict[str, Any]:
+        """It for machines, and in words.
+
+        Args:
+            made: how many places are estimated anew.
+            places: how many there are.
+            at_most: both are not known before the sources are read.
+        """
+        limit, done = ("at most ", "are to be ") if at_most else ("", "")
+        gone = f" and {self.removed:,} removed" if self.removed else ""
+        tiles = f"map: {limit}{self.changed:,} of {self.of:,} tiles changed{gone}"
+        told = f"{tiles}; {limit}{made:,} of {places:,} places {done}recomputed"
+        counts = {"places_recomputed": made, "places": places, "at_most": at_most}
+        return {"told": told, **{f"tiles_{k}": v for k, v in asdict(self).items()}, **counts}
+
+
+def tell(settings: RunSettings, map_plan: MapPlan) -> None:
+    """Write down which map the report is of, once all its files are written."""
+    report, store = settings.folder.under(REPORT), map_plan.store.settings
+    told = Told(
+        store.tile_size,
+        store.crs,
+        _tiles_of(map_plan),
+        _hash(settings),
+        checksum_of(report.under(PLACES)),
+    )
+    write_text(report.under(TILES), json.dumps(sealed(asdict(told)), indent=0) + "\n")
+
+
+def update_of(settings: RunSettings, map_plan: MapPlan) -> Update | None:
+    """What is new in a map since the last report; None: it is of this map, or there is none that
+    says it.
+    """
+    try:
+        told, now = told_in(settings.folder.under(REPORT)), _tiles_of(map_plan)
+    except DamagedError:
+        return None
+    if told is None or told.tiles == now:
+        return None
+    changed = sum(told.tiles.get(name) != identity for name, identity in now.items())
+    return Update(changed, len(told.tiles.keys() - now.keys()), len(now))
+
+
+def keep_before(settings: RunSettings) -> None:
+    """Keep the last report's places, of a map that is updated now.
+
+    The report is not touched before all else is done: where an update is stopped and called again,
+    the same is kept again. A report that was being written when its call was stopped is of the
+    updated map, and is not kept.
+    """
+    report, before = (settings.folder.under(name) for name in (REPORT, BEFORE))
+    told, places = told_in(report), report.under(PLACES)
+    if told is not None and places.there() and told.places == checksum_of(places):
+        before.under(TILES).remove()  # it must not vouch for other places
+        before.under(PLACES).write(places.read())
+        before.under(TILES).write(report.under(TILES).read())
+
+
+def told_in(folder: Files) -> Told | None:
+    """The map that the places in a folder are of; None: it does not say.
+
+    Raises:
+        DamagedError: that is not what was written.
+    """
+    file = folder.under(TILES)
+    try:
+        return Told(**unsealed(json.loads(file.read())))
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except (ValueError, TypeError) as error:
+        raise DamagedError(f"{file.address} is damaged ({error}): {AGAIN}") from error
+
+
+def before_update(run_dir: Files) -> tuple[Told, pd.DataFrame]:
+    """The map and the places of a run before its last update.
+
+    Raises:
+        UsageError: the run has not been updated.
+        DamagedError: they are not what was written.
+    """
+    before = run_dir.under(BEFORE)
+    told = told_in(before)
+    if told is None:
+        raise UsageError(
+            f"{run_dir.address} keeps no estimates of before: its map was not updated there; name "
+            "two run directories, or two maps, the older one first"
+        )
+    if told.places != checksum_of(before.under(PLACES)):
+        raise DamagedError(f"{before.under(PLACES).address} is damaged, its checksum does not fit")
+    return told, places_in(before)
+
+
+def places_in(folder: Files) -> pd.DataFrame:
+    """The places of a report, a row each."""
+    rows = pd.read_parquet(io.BytesIO(folder.under(PLACES).read()))
+    return rows.drop(columns="geometry", errors="ignore")
+
+
+def _tiles_of(map_plan: MapPlan) -> dict[str, str]:
+    return {str(key): tile.identity for key, tile in sorted(map_plan.points.items())}
+
+
+def _hash(settings: RunSettings) -> str:
+    making: dict[str, Any] = making_of(settings)
+    return hash_of(making, settings.model, settings.spacing)
