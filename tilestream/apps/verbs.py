@@ -14,7 +14,7 @@ from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.engine.stage import Task
 from tilestream.pipeline.jobs import run as main_job
 from tilestream.pipeline.jobs import simulate as simulation
-from tilestream.pipeline.jobs.forecast import forecast
+from tilestream.pipeline.jobs.forecast import forecast, to_do
 from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
 from tilestream.pipeline.jobs.simulation_record import Size
 from tilestream.records import District
@@ -41,9 +41,11 @@ def plan(config: RunSettings | str | os.PathLike[str]) -> pd.DataFrame:
         config: the settings, or a YAML file of them, as `ts.run` takes it.
 
     Returns:
-        A row per stage: `stage`, `tasks`, `work` (in what the stage counts), `after` (the stages
-        that it waits for), `promised_bytes` (the most that one of its tasks may use),
-        `core_hours`. `attrs["notes"]` has what was noticed, by source.
+        A row per stage: `stage`, `tasks`, `work` (in what the stage counts), `to_do` (the part of
+        the work that is not done), `after` (the stages that it waits for), `promised_bytes` (the
+        most that one of its tasks may use), `core_hours` (of what is to do). `attrs["notes"]` has
+        what was noticed, by source, `attrs["update"]` what an update of the map reaches at most
+        (None: it is none).
 
     Raises:
         PlanError: a task does not fit `memory`.
@@ -57,15 +59,17 @@ def plan(config: RunSettings | str | os.PathLike[str]) -> pd.DataFrame:
     expected = forecast(config if isinstance(config, RunSettings) else read_settings(config))
     table = pd.DataFrame(
         stage_rows(expected.tasks),
-        columns=["stage", "tasks", "work", "after", "promised_bytes", "core_hours"],
+        columns=["stage", "tasks", "work", "to_do", "after", "promised_bytes", "core_hours"],
     )
+    table.attrs["update"] = expected.update
     table.attrs["notes"] = {source: list(notes) for source, notes in expected.notes.items()}
     return table
 
 
 def stage_rows(tasks: Sequence[Task]) -> list[dict[str, object]]:
     """The stages of some tasks, in their order; the columns of `plan`."""
-    hours = core_hours(tasks)
+    left = to_do(tasks)
+    hours = core_hours(left)
     stages = {task.key: task.stage for task in tasks}
     rows: list[dict[str, object]] = []
     for stage in dict.fromkeys(stages.values()):
@@ -76,9 +80,10 @@ def stage_rows(tasks: Sequence[Task]) -> list[dict[str, object]]:
                 "stage": stage,
                 "tasks": len(own),
                 "work": sum(task.work for task in own),
+                "to_do": sum(task.work for task in left if task.stage == stage),
                 "after": sorted(after - {stage}),
                 "promised_bytes": max(task.promised_bytes for task in own),
-                "core_hours": round(hours[stage], 4),
+                "core_hours": round(hours.get(stage, 0.0), 4),
             }
         )
     return rows

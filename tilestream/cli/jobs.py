@@ -246,9 +246,11 @@ def show_plan(settings: RunSettings, as_json: bool) -> None:
     expected = forecast(settings)
     rows = verbs.stage_rows(expected.tasks)
     if as_json:
-        print_json({"stages": rows, "notes": expected.notes})
+        print_json({"stages": rows, "update": expected.update, "notes": expected.notes})
         return
     out.print(forecast_table(rows))
+    if expected.update is not None:
+        say(expected.update["told"])
     say_notes(expected.notes, to=out)
 
 

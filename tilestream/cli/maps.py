@@ -23,6 +23,8 @@ from tilestream.cli.tables import (
 )
 from tilestream.errors import PartialError
 from tilestream.pipeline.jobs import ingest as ingest_map
+from tilestream.pipeline.jobs.map_expected import tiles_to_read
+from tilestream.pipeline.jobs.map_update import Update, tiles_written
 from tilestream.pipeline.jobs.run_inputs import ingest_settings, scans_of
 from tilestream.pipeline.jobs.sources import map_notes
 from tilestream.pipeline.jobs.starts_of import starts_of as ends_of
@@ -45,9 +47,14 @@ def ingest(
 ) -> None:
     """Make a tile store from point clouds, map directories and logs of drives."""
     settings, scans, allowed = ingest_settings(how), scans_of(how), limits.memory
+    had = tiles_written(store)
     if dry_run:
         planned = ingest_map.plan_ingest(sources, store, settings, allowed, how.log_options, scans)
+        points = planned.expected(tiles_to_read(planned)[0]).points
+        update = Update.between(had, {key: tile.identity for key, tile in points.items()})
         out.print(plan_table(planned.scatters))
+        if update is not None:
+            say(update.facts(at_most=True)["told"])
         say_notes(planned.notes)
         if planned.left_out:
             raise PartialError(f"{store}: sources that would be left out:", planned.left_out)
@@ -68,11 +75,14 @@ def ingest(
         except PartialError as error:
             failed = error
     made = open_store(store)
+    update = Update.between(had, tiles_written(store))
     if as_json:
-        print_json(store_facts(made))
+        print_json({**store_facts(made), "update": None if update is None else update.facts()})
     else:
         print_sources(made)
         out.print(tile_table(made))
+        if update is not None:
+            say(update.facts()["told"])
     if failed is not None:
         raise failed
 

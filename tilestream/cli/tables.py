@@ -52,19 +52,18 @@ def forecast_table(rows: list[dict[str, object]]) -> Table:
     """The same for people."""
     table = Table(title="plan", title_justify="left", box=SIMPLE)
     table.add_column("stage")
-    for column in ("tasks", "work", "memory per task", "core-hours"):
+    for column in ("tasks", "work", "to do", "memory per task", "core-hours"):
         table.add_column(column, justify="right")
     table.add_column("after")
     for row in rows:
         after = ", ".join(row["after"]) if isinstance(row["after"], list) else ""
         memory = megabytes(int(str(row["promised_bytes"])))
         hours = f"{float(str(row['core_hours'])):.3f}"
-        table.add_row(
-            str(row["stage"]), str(row["tasks"]), f"{row['work']:,}", memory, hours, after
-        )
+        work, left = (f"{row[name]:,}" for name in ("work", "to_do"))
+        table.add_row(str(row["stage"]), str(row["tasks"]), work, left, memory, hours, after)
     total = sum(float(str(row["core_hours"])) for row in rows)
     table.add_row(
-        "all", str(sum(int(str(row["tasks"])) for row in rows)), "", "", f"{total:.3f}", ""
+        "all", str(sum(int(str(row["tasks"])) for row in rows)), "", "", "", f"{total:.3f}", ""
     )
     return table
 

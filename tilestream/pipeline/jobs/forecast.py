@@ -1,19 +1,18 @@
 """What the main job would run, from headers alone: before anything is read or written."""
 
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from tilestream.errors import StoreNotFoundError
-from tilestream.formats import describe
-from tilestream.grid import MM_PER_M, Box, TileKey
 from tilestream.notes import MATCHER, Notes, noticed
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.stage import Task
 from tilestream.pipeline.jobs.along_routes import off_map
 from tilestream.pipeline.jobs.estimator import estimator_of
-from tilestream.pipeline.jobs.ingest import plan_ingest, store_settings
+from tilestream.pipeline.jobs.ingest import plan_ingest
+from tilestream.pipeline.jobs.map_expected import tiles_to_read
+from tilestream.pipeline.jobs.run_before import update_of
 from tilestream.pipeline.jobs.run_inputs import (
     Inputs,
     check_model,
@@ -30,10 +29,10 @@ from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
 from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.jobs.simulate import plan_simulation
 from tilestream.pipeline.jobs.sources import map_notes
-from tilestream.pipeline.stages.map_plan import MapPlan, TilePoints
-from tilestream.pipeline.stages.scatter import SourceSpan
+from tilestream.pipeline.stages.map_plan import MapPlan
+from tilestream.pipeline.stages.predict import predict
 from tilestream.settings import SimulateSettings
-from tilestream.store import TileStore, open_store
+from tilestream.store import open_store
 
 PLAN = "plan"
 """What notes are filed under that are about the plan itself."""
@@ -49,6 +48,9 @@ class Forecast:
     notes: Notes
     """What was noticed of the inputs by source, and as `plan` what is not known before the job
     runs."""
+    update: Mapping[str, Any] | None = None
+    """Of a run whose map is updated: tiles that change, places that are recomputed, at most, and
+    both in words (`told`); None: it is none."""
 
 
 def forecast(settings: RunSettings) -> Forecast:
@@ -73,7 +75,33 @@ def forecast(settings: RunSettings) -> Forecast:
     lost = [f"{name} is left out: {reason}" for name, reason in measure.left_out.items()]
     few = [by.few] if by.few else []
     own = {PLAN: [*few, *lost], MATCHER: settings.label.registration.notes}
-    return Forecast(tasks, noticed(notes, inputs.notes, far, own))
+    return Forecast(
+        tasks, noticed(notes, inputs.notes, far, own), _update(settings, map_plan, tasks)
+    )
+
+
+def _update(
+    settings: RunSettings, map_plan: MapPlan, tasks: Sequence[Task]
+) -> dict[str, Any] | None:
+    """What an update of the map reaches, at most; None: the map is as it was, or is new."""
+    update = update_of(settings, map_plan)
+    if update is None:
+        return None
+    places = [task for task in tasks if task.stage == predict.name]
+    left = sum(task.work for task in to_do(places))
+    return update.along(left, sum(task.work for task in places), at_most=True)
+
+
+def to_do(tasks: Iterable[Task]) -> list[Task]:
+    """Those of some tasks that are not done."""
+    return [task for task in tasks if not _is_done(task)]
+
+
+def _is_done(task: Task) -> bool:
+    try:
+        return task.writes.known(task.identity) is not None
+    except StoreNotFoundError:
+        return False
 
 
 def _simulation_first(settings: RunSettings, wanted: SimulateSettings) -> Forecast:
@@ -84,7 +112,7 @@ def _simulation_first(settings: RunSettings, wanted: SimulateSettings) -> Foreca
         task.writes: task
         for plan in plans
         for task in plan.tasks
-        if task.writes.known(task.identity) is None
+        if not _is_done(task)
     }  # all drives have one survey
     note = f"first the city is simulated in {folder}; plan again to see what follows"
     return Forecast(tuple(missing.values()), {PLAN: [note]})
@@ -94,17 +122,10 @@ def _expected_map(
     settings: RunSettings, inputs: Inputs
 ) -> tuple[MapPlan, tuple[Task, ...], Notes, list[dict[str, Any]]]:
     """The map as it is, or as the bounds of its sources let expect it; its sources as recorded."""
-    try:
+    if not inputs.sources:
         store = open_store(settings.store_url)
-    except StoreNotFoundError:
-        if not inputs.sources:
-            raise
-    else:
-        if store.sources():
-            told = {PLAN: ["the map is there; changed sources are read again"]}
-            partial = bool(inputs.sources) or settings.map.partial
-            there = MapPlan.of_store(store, partial=partial)
-            return there, (), noticed(told, map_notes(store)), store.sources()
+        there = MapPlan.of_store(store, partial=settings.map.partial)
+        return there, (), map_notes(store), store.sources()
     planned = plan_ingest(
         inputs.sources,
         settings.store_url,
@@ -113,23 +134,14 @@ def _expected_map(
         settings.map.log_options,
         map_scans(settings, inputs),
     )
-    store = TileStore(settings.store_url, store_settings(ingest_settings(settings.map)))
-    have: dict[TileKey, TilePoints] = {}
-    unknown: list[str] = []
-    spans = [task.reads["blocks"] for task in planned.scatters.tasks]
-    opened_with = {span.path: span.options for span in spans if isinstance(span, SourceSpan)}
-    for path, options in sorted(opened_with.items()):
-        bounds = describe(path, **dict(options)).bounds
-        if bounds is None:
-            unknown.append(path)
-        else:
-            low, high = (np.round(np.array(corner) * MM_PER_M).astype(int) for corner in bounds)
-            box = Box(int(low[0]), int(low[1]), int(high[0]) + 1, int(high[1]) + 1)
-            have |= dict.fromkeys(store.grid.keys_over(box), TilePoints("expected", "", 0))
+    tiles, unknown = tiles_to_read(planned)
+    expected = planned.expected(tiles)
     notes = [f"{path} is left out: {reason}" for path, reason in planned.left_out.items()]
-    notes += [f"at most {len(have)} tiles, by the bounds of the sources; reading tells which"]
+    if tiles:
+        count = len(expected.points)
+        notes.append(f"at most {count} tiles, by the bounds of the sources; reading tells which")
     if unknown:
         notes.append(f"only reading tells where the points of {', '.join(unknown[:3])} are")
     sources = [source.record for source in planned.found]
     told = noticed({PLAN: notes}, planned.notes)
-    return MapPlan(store, have), planned.scatters.tasks, told, sources
+    return expected, planned.scatters.tasks, told, sources

@@ -110,12 +110,19 @@ def read_sources(
 ) -> Reading:
     """What `ingest` begins with; arguments and errors as there."""
     found = within(examine_all(sources, settings, log_options, scans), memory)
-    store = _create_or_resume(str(url), with_crs(settings, found), found)
-    current = _is_current(store, found)
+    wanted = store_settings(with_crs(settings, found))
+    store = _there(str(url), wanted, found) or TileStore.create(url, wanted)
     recorded = _recorded(store, found)
-    if current and recorded != store.sources():
+    reading = _reading(store, found, memory)
+    if reading.current and recorded != store.sources():
         store.end(recorded, MADE_BY)  # the sources have moved, or have other names now
-    as_before = {} if current else remembered(store, found, recorded)
+    return reading
+
+
+def _reading(store: TileStore, found: Sequence[Source], memory: int) -> Reading:
+    """What is to be read of sources, of a store that is there."""
+    current = _is_current(store, found)
+    as_before = {} if current else remembered(store, found, _recorded(store, found))
     return Reading(store, found, memory, current=current, remembered=as_before)
 
 
@@ -141,21 +148,23 @@ def plan_ingest(
     found = examine_all(sources, settings, log_options, scans)
     if all(source.reason for source in found):
         raise SourceError(found[0].reason)
-    store = TileStore(str(url), store_settings(with_crs(settings, found)))
-    return Reading(store, found, memory)
+    wanted = store_settings(with_crs(settings, found))
+    there = _there(str(url), wanted, found)
+    if there is None:
+        return Reading(TileStore(str(url), wanted), found, memory)
+    return _reading(there, found, memory)
 
 
-def _create_or_resume(url: str, settings: IngestSettings, found: Sequence[Source]) -> TileStore:
-    """The store to write to: a new one, or the one that is there if it is the same map.
+def _there(url: str, wanted: StoreSettings, found: Sequence[Source]) -> TileStore | None:
+    """The store to write to, if it is there and is the same map; None: none is there.
 
     Raises:
         UsageError: the store has other settings, or knows a source that is there and was not given.
     """
-    wanted = store_settings(settings)
     try:
         store = open_store(url)
     except StoreNotFoundError:
-        return TileStore.create(url, wanted)
+        return None
     for name, value in asdict(wanted).items():
         there = getattr(store.settings, name)
         if there != value and not (name == "crs" and _fits(value, there)):

@@ -21,7 +21,7 @@ from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.engine.stage import Task
 from tilestream.pipeline.jobs.sources import Source, as_read, as_remembered
 from tilestream.pipeline.jobs.strays import without_strays
-from tilestream.pipeline.stages.map_plan import MapPlan
+from tilestream.pipeline.stages.map_plan import MapPlan, TilePoints
 from tilestream.pipeline.stages.merge import merge, merge_tasks
 from tilestream.pipeline.stages.scatter import (
     Fragment,
@@ -51,24 +51,6 @@ class Remembered:
         return all(one.only(known[start]).shares == known[start] for start, one in read.items())
 
 
-@dataclass(frozen=True)
-class Changes:
-    """Which tiles of a map are made or removed by an update."""
-
-    made: tuple[TileKey, ...]
-    """Those that are new or have changed, or were lost."""
-    removed: tuple[TileKey, ...]
-    """Those that the map had and has not."""
-    tiles: int
-    """How many the map has."""
-    update: bool
-    """Whether there was a map before."""
-
-    def __str__(self) -> str:
-        gone = f", {len(self.removed):,} are gone" if self.removed else ""
-        return f"{len(self.made):,} of {self.tiles:,} tiles changed{gone}"
-
-
 class Reading:
     """A map in the making: its sources are read first, then it is known which tiles it has."""
 
@@ -94,10 +76,11 @@ class Reading:
         self.found = list(found)
         self.merges: tuple[Task, ...] = ()
         """The tasks that write tiles, once all sources are read."""
-        self.changes: Changes | None = None
-        """What changes, as soon as that is known; None: it is not, or nothing does."""
+        self.sorted_out = False
+        """Whether all is read, and it is known which tiles differ."""
+        self.current = current
+        """Whether nothing is left to do."""
         self._memory = memory
-        self._current = current
         self._remembered = dict(remembered or {})
         self._opened = tuple(found)
         readable = [(s.info, s.spans, s.state, s.options) for s in found if s.info is not None]
@@ -141,14 +124,32 @@ class Reading:
         Raises:
             PartialError: none can be read; the map stays as it was.
         """
-        if not self._open and not self._current:
+        if not self._open and not self.current:
             self._next()
         return self.scatters
 
+    def expected(self, read: Iterable[TileKey]) -> MapPlan:
+        """The map as it will be, before anything is read; `scatters` are then all tasks that will
+        read.
+
+        Args:
+            read: the tiles that the sources that are read first may give points to.
+        """
+        if self.current:
+            return MapPlan.of_store(self.store, partial=True)
+        self._given = {path: before.given for path, before in self._remembered.items()}
+        wanted, touched = self._wanted(()), set(read)
+        touched |= wanted.keys() - self._written.keys()
+        self._open |= self._giving(touched)
+        marks = self.store.written(touched)
+        counts = {key: marks[key].facts["points"] for key in touched if key in marks}
+        points = MapPlan.of_merges(self.store, (), self._written).points
+        expected = {key: TilePoints("expected", "", counts.get(key, 0)) for key in touched}
+        return MapPlan(self.store, {**points, **expected})
+
     def grown(self, outcome: Outcome) -> tuple[Task, ...] | None:
         """What to run as soon as the last source is read: other spans, of tiles that differ; when
-        those are read too, the tasks that write tiles (`changes` is known then). None: not all is
-        read yet.
+        those are read too, the tasks that write tiles (`sorted_out`). None: not all is read yet.
 
         Raises:
             PartialError: no source could be read; the map stays as it was.
@@ -171,7 +172,7 @@ class Reading:
         Raises:
             SourceError: the sources hold no points.
         """
-        if self._current:
+        if self.current:
             return {}
         ended = {outcome.key: outcome for outcome in outcomes}
         failed = {task.key: ended[task.key].reason for task in self.merges if task.key in ended}
@@ -199,17 +200,21 @@ class Reading:
         }
         if self._open:
             return self.scatters.tasks
+        wanted = self._wanted(fragments)
+        self._open = self._giving(wanted.keys() - self._written.keys())
+        return self.scatters.tasks if self._open else self._begin(wanted)
+
+    def _wanted(self, fragments: Iterable[Fragment]) -> dict[TileKey, Task]:
+        """The task that merges each tile, of what the sources give; notes which are written."""
         totals: dict[TileKey, Share] = {}
         for given in self._given.values():
             for tiles in given.values():
                 for key, share in tiles.items():
                     totals[key] = added(totals.get(key, (0, 0, 0)), share)
         tasks = merge_tasks(self.store, totals, fragments, self._memory)
-        marks = self.store.written(totals)
-        wanted = {task.tile: task for task in tasks if task.tile is not None}
+        marks, wanted = self.store.written(totals), {t.tile: t for t in tasks if t.tile is not None}
         self._written = {k: m for k, m in marks.items() if m.is_of(wanted[k].identity)}
-        self._open = self._giving(wanted.keys() - self._written.keys())
-        return self.scatters.tasks if self._open else self._begin(wanted)
+        return wanted
 
     def _settled(self) -> list[Fragment]:
         """Find what each source gives, as it is remembered, else as it was read; the fragments of
@@ -256,9 +261,7 @@ class Reading:
             )
         made = {key: task for key, task in wanted.items() if key not in self._written}
         self.merges = Plan.of(made.values(), self._memory).tasks
-        had = {} if self.store.manifest is None else self.store.manifest.identities
-        removed = tuple(key for key in had if key not in wanted)
-        self.changes = Changes(tuple(made), removed, len(wanted), bool(had))
+        self.sorted_out = True
         tiles = {key: (task.identity, task.counts["points"]) for key, task in wanted.items()}
         self.store.begin(Manifest.of(tiles))
         return self.merges

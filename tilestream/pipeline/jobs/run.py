@@ -129,7 +129,7 @@ def _run(settings: RunSettings, client: Any | None, watch: Watch | None) -> None
         _report(settings, inputs, story, book)
     if story.update is not None:
         made = book.stages().get("predict", {"made": 0})["made"]
-        book.facts["update"] = story.update.facts(int(made), story.places)
+        book.facts["update"] = story.update.along(int(made), story.places)
     book.facts["files"] = checksums(settings.folder)
     for name in ("", "tables", "report", "report/figures", "before"):
         settings.folder.under(name).remove_parts()

@@ -18,6 +18,7 @@ from tilestream.errors import DamagedError, UsageError
 from tilestream.files import Files
 from tilestream.grid import TileKey
 from tilestream.marks import AGAIN, hash_of, sealed, unsealed
+from tilestream.pipeline.jobs.map_update import Update
 from tilestream.pipeline.jobs.run_book import checksum_of, write_text
 from tilestream.pipeline.jobs.run_inputs import making_of
 from tilestream.pipeline.jobs.run_settings import RunSettings
@@ -49,40 +50,13 @@ class Told:
         return {TileKey.parse(name): identity for name, identity in self.tiles.items()}
 
 
-@dataclass(frozen=True)
-class Update:
-    """Which tiles of a map are others than those of the last report."""
-
-    changed: int
-    """That are new, or whose points are others."""
-    removed: int
-    """That the map has no more."""
-    of: int
-    """How many tiles the map has."""
-
-    def facts(self, made: int, places: int, at_most: bool = False) -> dict[str, Any]:
-        """It for machines, and in words.
-
-        Args:
-            made: how many places are estimated anew.
-            places: how many there are.
-            at_most: both are not known before the sources are read.
-        """
-        limit, done = ("at most ", "are to be ") if at_most else ("", "")
-        gone = f" and {self.removed:,} removed" if self.removed else ""
-        tiles = f"map: {limit}{self.changed:,} of {self.of:,} tiles changed{gone}"
-        told = f"{tiles}; {limit}{made:,} of {places:,} places {done}recomputed"
-        counts = {"places_recomputed": made, "places": places, "at_most": at_most}
-        return {"told": told, **{f"tiles_{k}": v for k, v in asdict(self).items()}, **counts}
-
-
 def tell(settings: RunSettings, map_plan: MapPlan) -> None:
     """Write down which map the report is of, once all its files are written."""
     report, store = settings.folder.under(REPORT), map_plan.store.settings
     told = Told(
         store.tile_size,
         store.crs,
-        _tiles_of(map_plan),
+        {str(key): tile.identity for key, tile in sorted(map_plan.points.items())},
         _hash(settings),
         checksum_of(report.under(PLACES)),
     )
@@ -94,13 +68,11 @@ def update_of(settings: RunSettings, map_plan: MapPlan) -> Update | None:
     says it.
     """
     try:
-        told, now = told_in(settings.folder.under(REPORT)), _tiles_of(map_plan)
+        told = told_in(settings.folder.under(REPORT))
     except DamagedError:
         return None
-    if told is None or told.tiles == now:
-        return None
-    changed = sum(told.tiles.get(name) != identity for name, identity in now.items())
-    return Update(changed, len(told.tiles.keys() - now.keys()), len(now))
+    now = {key: tile.identity for key, tile in map_plan.points.items()}
+    return None if told is None else Update.between(told.keys, now)
 
 
 def keep_before(settings: RunSettings) -> None:
@@ -156,10 +128,6 @@ def places_in(folder: Files) -> pd.DataFrame:
     """The places of a report, a row each."""
     rows = pd.read_parquet(io.BytesIO(folder.under(PLACES).read()))
     return rows.drop(columns="geometry", errors="ignore")
-
-
-def _tiles_of(map_plan: MapPlan) -> dict[str, str]:
-    return {str(key): tile.identity for key, tile in sorted(map_plan.points.items())}
 
 
 def _hash(settings: RunSettings) -> str:

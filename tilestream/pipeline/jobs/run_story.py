@@ -13,7 +13,8 @@ from tilestream.pipeline.engine.stage import Task
 from tilestream.pipeline.jobs.estimator import LABELS, Estimator, estimator_of
 from tilestream.pipeline.jobs.inventory import announce, withdraw
 from tilestream.pipeline.jobs.map_reading import Reading
-from tilestream.pipeline.jobs.run_before import Update, keep_before, update_of
+from tilestream.pipeline.jobs.map_update import Update
+from tilestream.pipeline.jobs.run_before import keep_before, update_of
 from tilestream.pipeline.jobs.run_book import Book
 from tilestream.pipeline.jobs.run_inputs import Inputs, read_map
 from tilestream.pipeline.jobs.run_notes import with_logs
@@ -77,7 +78,7 @@ class Story:
         """What is to be done now that a task has ended."""
         more = self.reading.grown(outcome) if self.reading else None
         if self.reading is not None and more is not None:
-            if self.reading.changes is None:  # what else is to be read of the tiles that differ
+            if not self.reading.sorted_out:  # what else is to be read of the tiles that differ
                 return self._known(more)
             self._tiles = {task.key for task in more}
             if not more:
