@@ -1,23 +1,26 @@
 """What a map update changes: tiles, and sample points whose estimated error got worse."""
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
 import pandas as pd
-from scipy.spatial import cKDTree
 
+from tilestream.apps.changes import Changes, changes
+from tilestream.apps.runs import places_of
 from tilestream.crs import require_same
 from tilestream.errors import UsageError
+from tilestream.files import Files
 from tilestream.grid import TileKey
 from tilestream.notes import Notes, noticed
-from tilestream.pipeline.jobs.run_folder import map_of, rows_of
+from tilestream.pipeline.jobs.run_before import REPORT, before_update, told_in
+from tilestream.pipeline.jobs.run_folder import map_of
 from tilestream.pipeline.jobs.sources import map_notes
 
-SAME_PLACE = 0.5
-"""Sample points this near to each other are compared [m]: half their spacing."""
 WORSE = 0.02
 """Estimates that grew by more than this count as worse [m]."""
+OTHERWISE = "its estimates were made with other settings, not only of another map"
+"""What is noted of two runs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,76 +35,109 @@ class MapDiff:
     """Tiles whose points are others."""
     same: int
     """Tiles that are the same."""
-    worse: pd.DataFrame
-    """Sample points whose estimate got worse, the worst first: `route_id`, `arc_length`, `x`, `y`,
-    `before`, `after`, `change` [m]."""
-    compared: int
-    """Sample points with an estimate in both; 0 where one of them has none."""
+    places: Changes
+    """Places whose estimates changed, where both have some."""
+    limit: float
+    """Estimates that grew or fell by more than this count as worse or better [m]."""
     notes: Notes
     """What was noticed of the sources of both maps, by source."""
 
+    @property
+    def worse(self) -> pd.DataFrame:
+        """Sample points whose estimate got worse, the worst first: `route_id`, `arc_length`, `x`,
+        `y`, `before`, `after`, `change`, `length` of road [m], `why`.
+        """
+        return self.places.worse
+
+    @property
+    def compared(self) -> int:
+        """Sample points with an estimate in both; 0 where one of them has none."""
+        return self.places.compared
+
 
 def diff(
-    old: str | os.PathLike[str], new: str | os.PathLike[str], *, worse: float = WORSE
+    old: str | os.PathLike[str],
+    new: str | os.PathLike[str] | None = None,
+    *,
+    worse: float = WORSE,
 ) -> MapDiff:
-    """Compare two maps, and their estimates where both have some.
+    """Compare two maps, and their estimates where both have some: what got worse, where and why.
 
     Args:
         old: a run directory (with estimates) or a tile store.
-        new: likewise.
-        worse: estimates that grew by more than this are listed [m].
+        new: likewise; None: the run `old` as it is now, with what it was before its map was last
+            updated.
+        worse: estimates that grew by more than this are worse, that fell by more better [m].
 
     Raises:
         StoreNotFoundError: nothing there.
-        UsageError: tiles of different size, which cannot be compared.
+        UsageError: tiles of different size, which cannot be compared, or one run whose map was not
+            updated.
         CrsError: maps in two CRS.
 
     Examples:
         >>> ts.diff("map.zarr", "map.zarr").same
         2
     """
-    before, after = map_of(old), map_of(new)
-    if before.settings.tile_size != after.settings.tile_size:
+    before = _was(old) if new is None else _is(old)
+    after = _is(old if new is None else new)
+    if before.tile_size != after.tile_size:
         raise UsageError(
-            f"{before.url} has tiles of {before.settings.tile_size:g} m and {after.url} of "
-            f"{after.settings.tile_size:g} m: compare maps of one tile size"
+            f"{before.named} has tiles of {before.tile_size:g} m and {after.named} of "
+            f"{after.tile_size:g} m: compare maps of one tile size"
         )
-    require_same(before.url, before.settings.crs, after.url, after.settings.crs)
-    had, has = before.identities(), after.identities()
+    require_same(before.named, before.crs, after.named, after.crs)
+    had, has = before.tiles, after.tiles
     both = sorted(set(had) & set(has))
-    points, compared = _worse(_estimates(old), _estimates(new), worse)
+    told = {}
+    if before.settings and after.settings and before.settings != after.settings:
+        told = {after.named: [OTHERWISE]}
     return MapDiff(
         tuple(sorted(set(has) - set(had))),
         tuple(sorted(set(had) - set(has))),
         tuple(key for key in both if had[key] != has[key]),
         sum(had[key] == has[key] for key in both),
-        points,
-        compared,
-        noticed(map_notes(before), map_notes(after)),
+        changes(before.places, after.places, worse),
+        worse,
+        noticed(before.notes, after.notes, told),
     )
 
 
+@dataclass(frozen=True, eq=False)
+class _Side:
+    """One of the two that are compared."""
+
+    named: str
+    tile_size: float
+    crs: str | None
+    tiles: Mapping[TileKey, str]
+    places: pd.DataFrame | None
+    notes: Notes
+    settings: str = ""
+
+
+def _is(place: str | os.PathLike[str]) -> _Side:
+    """A run or a store as it is."""
+    store, told = map_of(place), told_in(Files.at(place).under(REPORT))
+    return _Side(
+        store.url,
+        store.settings.tile_size,
+        store.settings.crs,
+        store.identities(),
+        _estimates(place),
+        map_notes(store),
+        "" if told is None else told.settings,
+    )
+
+
+def _was(place: str | os.PathLike[str]) -> _Side:
+    """A run as it was before its map was updated."""
+    told, places = before_update(Files.at(place))
+    named = f"{place}, before"
+    return _Side(named, told.tile_size, told.crs, told.keys, places, {}, told.settings)
+
+
 def _estimates(place: str | os.PathLike[str]) -> pd.DataFrame | None:
-    """The estimates of a run directory; None where there are none."""
-    rows = rows_of(place, "predictions")
-    if rows is None:
-        return None
-    kept: pd.DataFrame = rows[rows["status"] == "done"].reset_index(drop=True)
-    return kept
-
-
-def _worse(
-    old: pd.DataFrame | None, new: pd.DataFrame | None, limit: float
-) -> tuple[pd.DataFrame, int]:
-    names = ["route_id", "arc_length", "x", "y", "before", "after", "change"]
-    if old is None or new is None or old.empty or new.empty:
-        return pd.DataFrame(columns=names), 0
-    origin = old[["x", "y", "z"]].to_numpy(np.float64)[0]
-    tree = cKDTree(old[["x", "y", "z"]].to_numpy(np.float64) - origin)
-    distance, row = tree.query(new[["x", "y", "z"]].to_numpy(np.float64) - origin)
-    near = np.asarray(distance) <= SAME_PLACE
-    before = old["estimate"].to_numpy()[row]
-    table = new.assign(before=before, after=new["estimate"], change=new["estimate"] - before)
-    found = table.loc[near & (table["change"] > limit), names]
-    order = found.sort_values(["change", "route_id", "arc_length"], ascending=[False, True, True])
-    return order.reset_index(drop=True), int(near.sum())
+    """The places of a run with estimates and factors; None where there are none."""
+    rows = places_of(place)
+    return rows if "estimate" in rows else None

@@ -85,7 +85,7 @@ def read_run(place: str | os.PathLike[str]) -> pd.DataFrame:
         >>> table[["sample", "measured", "estimate"]].iloc[:2].to_numpy().tolist()
         [[0.0, nan, 0.1], [1.0, 0.3, 0.2]]
     """
-    table = with_labels(_places(place), _labels(place))
+    table = with_labels(places_of(place), _labels(place))
     if table.empty and not len(table.columns):
         raise SourceNotFoundError(f"{place}: no tables of a run; `ts.run` writes some")
     first = [name for name in (*PLACE, *OF_LABEL, *ESTIMATED) if name in table]
@@ -105,7 +105,7 @@ def _crs(place: str | os.PathLike[str]) -> str | None:
         return None
 
 
-def _places(place: str | os.PathLike[str]) -> pd.DataFrame:
+def places_of(place: str | os.PathLike[str]) -> pd.DataFrame:
     """Every sample point of the routes; of a run that has ended as its report has it, else as far
     as its tables go, each virtual drive of its own place alone.
     """

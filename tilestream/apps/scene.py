@@ -15,7 +15,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from tilestream.apps.diff import SAME_PLACE
+from tilestream.apps.changes import SAME_PLACE
 from tilestream.errors import TileNotReadyError, UsageError
 from tilestream.grid import MM_PER_M, Box, TileKey
 from tilestream.pipeline.jobs.run_folder import map_of, rows_of

@@ -75,7 +75,7 @@ COMMANDS = {
     ),
     "diff": (
         "maps",
-        "What a map update changes: tiles, and sample points whose estimate got worse.",
+        "What a map update changes: tiles, and how much road got worse, where and why.",
     ),
     "view": (
         "viewing",

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import pandas as pd
 import typer
 
+from tilestream.apps import diff as map_diff
 from tilestream.apps import verbs
 from tilestream.cli.cluster import ALL_CORES, HERE, AllCores, Cluster, on_cluster
 from tilestream.cli.fields import fields, with_settings
@@ -14,7 +15,7 @@ from tilestream.cli.options import AsJson, Changes, Config, DryRun
 from tilestream.cli.printing import err, out, print_json, say, say_notes
 from tilestream.cli.progress import progress
 from tilestream.cli.tables import forecast_table, plan_table, report_table
-from tilestream.errors import LimitError, PartialError
+from tilestream.errors import LimitError, PartialError, StoreError, UsageError
 from tilestream.files import Files
 from tilestream.pipeline.jobs import run as main_job
 from tilestream.pipeline.jobs import simulate as simulation
@@ -27,6 +28,7 @@ from tilestream.pipeline.stages.simulated import SCENE_BYTES
 from tilestream.records import District
 from tilestream.report import cards, gate
 from tilestream.report.drives import EVALUATED, DriveMeasured
+from tilestream.report.formatting import cm, distance
 from tilestream.report.gate import GateSettings, Over
 from tilestream.report.measured import Measured
 from tilestream.settings import (
@@ -149,10 +151,13 @@ def do_and_tell(
         folder, failed = settings.folder, error
         if "report" not in told_before(folder.under(RECORD)):  # of this call there is none
             raise
+    update = told_before(folder.under(RECORD)).get("update")
     if as_json:
-        print_json(report_of(folder))
+        print_json({**report_of(folder), "update": update})
     else:
         show_report(folder)
+        if update is not None:
+            show_update(folder, update)
     if failed is not None:
         raise failed
     if gate_of.fail_over is not None:
@@ -184,6 +189,21 @@ def show_report(folder: Files) -> None:
         say(line)
     say_notes(report["notes"])
     say(f"The report is at {folder.under('report/index.html').address}")
+
+
+def show_update(folder: Files, update: dict[str, Any]) -> None:
+    """Print what an update of the map reached, and how much road got worse by it."""
+    say(update["told"])
+    try:
+        found = map_diff.diff(folder.address)
+    except (
+        UsageError,
+        StoreError,
+    ):  # nothing is kept of before, as of a report of an older version
+        return
+    worse, limit = distance(float(found.worse["length"].sum())), cm(found.limit, 0)
+    why = f": `tilestream diff {folder.address}` says where and why" if len(found.worse) else ""
+    say(f"{worse} of road got worse by more than {limit}{why}")
 
 
 def hardly_measured(report: dict[str, Any]) -> list[str]:

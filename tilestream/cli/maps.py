@@ -14,11 +14,12 @@ from tilestream.cli.options import AsJson, DryRun, StoreUrl
 from tilestream.cli.printing import out, print_json, say, say_notes
 from tilestream.cli.progress import progress
 from tilestream.cli.tables import (
-    TILE_CHANGES,
+    diff_facts,
     diff_table,
     ends_table,
     info_table,
     plan_table,
+    stretch_table,
     tile_table,
 )
 from tilestream.errors import PartialError
@@ -195,22 +196,26 @@ def info(
 
 def diff(
     old: Annotated[str, typer.Argument(help="A run directory or tile store.")],
-    new: Annotated[str, typer.Argument(help="The newer one.")],
+    new: Annotated[
+        str | None,
+        typer.Argument(
+            help="The newer one.", show_default="the run as it is, after its last map update"
+        ),
+    ] = None,
     worse: Annotated[
-        float, typer.Option(help="List estimates that grew by more [m].")
+        float, typer.Option(help="Estimates that grew by more than this are worse [m].")
     ] = map_diff.WORSE,
     as_json: AsJson = False,
 ) -> None:
-    """What a map update changes: tiles, and sample points whose estimate got worse."""
+    """What a map update changes: tiles, and how much road got worse, where and why."""
     found = map_diff.diff(old, new, worse=worse)
     if as_json:
-        tiles = {kind: [str(k) for k in getattr(found, kind)] for kind in TILE_CHANGES}
-        points = found.worse.to_dict("records")
-        counts = {"same": found.same, "compared": found.compared, "notes": found.notes}
-        print_json({**tiles, **counts, "worse": points})
-    else:
-        out.print(diff_table(found))
-        say_notes(found.notes)
+        print_json(diff_facts(found))
+        return
+    out.print(diff_table(found))
+    if len(found.places.stretches):
+        out.print(stretch_table(found))
+    say_notes(found.notes)
 
 
 def print_sources(store: TileStore) -> None:

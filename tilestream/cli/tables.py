@@ -15,7 +15,7 @@ from tilestream.factors.catalogue import COLUMNS
 from tilestream.label import FAILED
 from tilestream.pipeline.engine.plan import Plan, megabytes
 from tilestream.report.drives import DriveMeasured
-from tilestream.report.formatting import cm_about
+from tilestream.report.formatting import cm, cm_about, distance
 from tilestream.report.paper_tables import LIMITS
 from tilestream.report.summary import digits_of
 from tilestream.store import POINTS, TileStore
@@ -218,25 +218,64 @@ def report_table(report: dict[str, Any], figures: Sequence[tuple[str, str]]) -> 
 
 
 TILE_CHANGES = ("added", "removed", "changed")
+STRETCHES = 10
+"""Stretches of road that a table shows."""
 
 
 def diff_table(found: MapDiff) -> Table:
-    """What a map update changes."""
-    table = Table(title="map update", title_justify="left", box=SIMPLE)
-    table.add_column("what")
-    table.add_column("count", justify="right")
-    table.add_column("which")
+    """What a map update changes: tiles, then how much road got worse or better."""
+    table = Table(title="map update", title_justify="left", box=SIMPLE, show_header=False)
+    table.add_column()
+    table.add_column(justify="right", no_wrap=True)
+    table.add_column()
     for kind in TILE_CHANGES:
         keys = [str(key) for key in getattr(found, kind)]
         more = " …" if len(keys) > 10 else ""
-        table.add_row(f"tiles {kind}", str(len(keys)), " ".join(keys[:10]) + more)
-    table.add_row("tiles the same", str(found.same), "")
-    table.add_row("sample points compared", str(found.compared), "")
-    table.add_row("sample points that got worse", str(len(found.worse)), "")
-    for row in found.worse.head(10).itertuples():
-        where = f"{row.route_id} at {row.arc_length:.0f} m"
-        table.add_row(where, "", f"{row.before:.3g} m to {row.after:.3g} m")
+        table.add_row(f"tiles {kind}", f"{len(keys):,}", " ".join(keys[:10]) + more)
+    table.add_row("tiles the same", f"{found.same:,}", "")
+    places = found.places
+    table.add_row("compared", distance(places.length), f"{places.compared:,} sample points")
+    by = f"by more than {cm(found.limit, 0)}"
+    for what, rows in (("worse", places.worse), ("better", places.better)):
+        length = distance(float(rows["length"].sum()))
+        table.add_row(f"got {what} {by}", length, f"{len(rows):,} sample points")
+    if places.lost:
+        table.add_row("lost their estimate", "", f"{places.lost:,} sample points")
     return table
+
+
+def stretch_table(found: MapDiff) -> Table:
+    """The stretches of road that got worse, the worst first."""
+    rows = found.places.stretches
+    more = f", the first {STRETCHES} of {len(rows):,}" if len(rows) > STRETCHES else ""
+    table = Table(title=f"what got worse{more}", title_justify="left", box=SIMPLE)
+    table.add_column("route")
+    for column in ("from", "to", "worst at", "before", "now"):
+        table.add_column(column, justify="right", no_wrap=True)
+    table.add_column("why")
+    for row in rows.head(STRETCHES).to_dict("records"):
+        where = (f"{row[name]:.0f} m" for name in ("begin", "end", "at"))
+        errors = (cm(row[name]) for name in ("before", "after"))
+        table.add_row(str(row["route_id"]), *where, *errors, row["why"])
+    return table
+
+
+def diff_facts(found: MapDiff) -> dict[str, Any]:
+    """The same for machines."""
+    places = found.places
+    tables = {name: getattr(places, name) for name in ("worse", "better", "stretches")}
+    return {
+        **{kind: [str(key) for key in getattr(found, kind)] for kind in TILE_CHANGES},
+        "same": found.same,
+        "compared": places.compared,
+        "compared_m": places.length,
+        "limit": found.limit,
+        "worse_m": float(places.worse["length"].sum()),
+        "better_m": float(places.better["length"].sum()),
+        "lost": places.lost,
+        "notes": found.notes,
+        **{name: rows.to_dict("records") for name, rows in tables.items()},
+    }
 
 
 def comparison_table(content: dict[str, Any]) -> Table:

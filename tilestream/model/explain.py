@@ -200,15 +200,31 @@ def compared(k: int, value: float, typical: Typical, *, named: bool = False) -> 
     """A factor's value beside the typical one, in units that a person reads: `89 cm, typically
     5 cm`. Lengths and shares are named only if `named` is set: their unit shows what they are.
     """
-    name, middle = typical.names[k], float(typical.middle[k])
-    times, unit = UNITS.get(typical.units[k], (1.0, f" {typical.units[k]}"))
-    named = named or not (name in SHARES or typical.units[k] == "m")
+    told = typical.names[k], typical.units[k], value, float(typical.middle[k])
+    return told_beside(*told, named=named, word="typically")
+
+
+def told_beside(
+    name: str, of: str, value: float, other: float, *, named: bool = False, word: str
+) -> str:
+    """A value of a factor beside another one, in units that a person reads: `89 cm, before 5 cm`.
+
+    Args:
+        name: the factor.
+        of: its unit (`Column.unit`).
+        value: the value.
+        other: the other one.
+        named: name the factor also where it is a length or a share.
+        word: what the other one is.
+    """
+    times, unit = UNITS.get(of, (1.0, f" {of}"))
+    named = named or not (name in SHARES or of == "m")
     if name in SHARES:
         times, unit = 100.0, "\u00a0%"
-    elif typical.units[k] == "m":
-        times, unit = (100.0, "\u00a0cm") if abs(middle) < 1.0 else (1.0, "\u00a0m")
-    here, usual = _apart(value * times, middle * times)
-    return f"{name + ' ' if named else ''}{here}{unit}, typically {usual}{unit}"
+    elif of == "m":
+        times, unit = (100.0, "\u00a0cm") if abs(other) < 1.0 else (1.0, "\u00a0m")
+    here, there = _apart(value * times, other * times)
+    return f"{name + ' ' if named else ''}{here}{unit}, {word} {there}{unit}"
 
 
 def _apart(value: float, other: float) -> tuple[str, str]:

@@ -60,7 +60,16 @@ def segments(places: pd.DataFrame, threshold: float) -> list[Int64]:
         places: `Findings.places`, in order.
         threshold: of the estimate, or of what was measured there [m].
     """
-    over = np.flatnonzero(measure_of(places).known > threshold)
+    return stretches(places, np.flatnonzero(measure_of(places).known > threshold))
+
+
+def stretches(places: pd.DataFrame, over: Int64) -> list[Int64]:
+    """Rows of each stretch of road that these rows make, with what it bridges (`segments`).
+
+    Args:
+        places: in order along each route.
+        over: the rows, rising.
+    """
     route, arc = places["route_id"].to_numpy()[over], places["arc_length"].to_numpy()[over]
     near = (np.diff(arc) <= BRIDGE) | ((np.diff(over) == 1) & joined(places)[over[:-1]])
     parts = np.split(over, np.flatnonzero(~near | (route[1:] != route[:-1])) + 1)

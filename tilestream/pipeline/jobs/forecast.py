@@ -109,10 +109,7 @@ def _simulation_first(settings: RunSettings, wanted: SimulateSettings) -> Foreca
     folder = simulated_folder(settings)
     plans = [plan_simulation(drive, folder, **extent(wanted)) for drive in simulations(wanted)]
     missing = {
-        task.writes: task
-        for plan in plans
-        for task in plan.tasks
-        if not _is_done(task)
+        task.writes: task for plan in plans for task in plan.tasks if not _is_done(task)
     }  # all drives have one survey
     note = f"first the city is simulated in {folder}; plan again to see what follows"
     return Forecast(tuple(missing.values()), {PLAN: [note]})
