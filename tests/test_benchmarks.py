@@ -43,6 +43,7 @@ SMALLEST = (
     "shinjuku_routes.py .",
     "simulate.py --metres 1",
     "trust.py --blocks 1 --rounds 1",
+    "update.py --edge 2 --replaced 1 --size 20 --spacing 10",
     "virtual_drive.py cost --tiles 1 --spacing 0.5",
     "walk.py",
 )

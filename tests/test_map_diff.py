@@ -7,15 +7,19 @@ import numpy as np
 import pandas as pd
 import pytest
 from hand_made import listed
+from hypothesis import given
+from hypothesis import strategies as st
 from scenes import scene
 
 import tilestream as ts
+from tilestream.apps.changes import NOTHING, changes
 from tilestream.apps.diff import diff
 from tilestream.cli import run
 from tilestream.errors import StoreNotFoundError, UsageError
 from tilestream.factors.rows import PLACE_COLUMNS
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.marks import Mark
+from tilestream.model.phrases import NO_POLES, SLIDES_ALONG
 from tilestream.model.training import PREDICTION_COLUMNS
 from tilestream.tables import write_table
 
@@ -71,6 +75,69 @@ def test_points_that_got_worse_are_listed_the_worst_first(two: tuple[Path, Path]
     assert found.worse["arc_length"].tolist() == [3.0, 1.1]
     assert found.worse["change"].tolist() == pytest.approx([0.2, 0.05])
     assert diff(*two, worse=0.1).worse["arc_length"].tolist() == [3.0]
+
+
+def test_lengths_stretches_and_what_got_better_or_lost(two: tuple[Path, Path]) -> None:
+    found = diff(*two, worse=0.005)
+    worse, better = found.places.worse, found.places.better
+    # places at 1.1, 2 and 3 m, then 40 m: each stands for half the way to its neighbours
+    assert worse["length"].tolist() == pytest.approx([(3.0 - 2.0) / 2 + 37.0 / 2, 0.9 / 2])
+    assert better["change"].tolist() == pytest.approx([-0.01])
+    assert better["length"].tolist() == pytest.approx([(3.0 - 1.1) / 2])
+    assert found.places.length == pytest.approx(worse["length"].sum() + better["length"].sum())
+    (stretch,) = found.places.stretches.to_dict("records")
+    assert (stretch["begin"], stretch["end"], stretch["at"]) == (1.1, 3.0, 3.0)
+    assert (stretch["before"], stretch["after"], stretch["places"]) == (0.1, 0.3, 3)
+    assert found.places.lost == 0
+    back = diff(two[1], two[0], worse=0.005)
+    assert back.places.worse["change"].tolist() == pytest.approx([0.01])
+    assert len(back.places.better) == 2
+
+
+def places(**columns: object) -> pd.DataFrame:
+    """Ten places a metre apart."""
+    x = np.arange(10.0)
+    at = {"route_id": "r", "sample": np.arange(10), "arc_length": x, "x": x, "y": 0.0, "z": 2.0}
+    return pd.DataFrame(at | {"heading": 0.0, "estimate": 0.1} | columns)
+
+
+def test_why_an_estimate_grew_is_the_part_and_the_factor_that_changed() -> None:
+    grown = np.where(np.arange(10) == 4, 0.5, 0.1 + 0.001 * np.arange(10))
+    poles = np.where(np.arange(10) == 4, 5.0, 100.0 - np.arange(10))
+    drive = dict.fromkeys(("vd_across", "vd_up"), 0.01)
+    old = places(D1_count=100.0 - np.arange(10), r_average=20.0, vd_along=0.02, **drive)
+    new = places(D1_count=poles, r_average=20.0, vd_along=grown, estimate=grown, **drive)
+    found = changes(old, new, 0.02)
+    assert found.worse["arc_length"].tolist() == [4.0]
+    (why,) = found.worse["why"]
+    assert why == (
+        f"{SLIDES_ALONG} (50\u00a0cm, before 2\u00a0cm); {NO_POLES} (D1_count 5, before 96)"
+    )
+    same = changes(old, old.assign(estimate=grown), 0.02)
+    assert same.worse["why"].tolist() == [NOTHING]
+
+
+def test_a_place_whose_map_is_gone_has_lost_its_estimate() -> None:
+    gone = np.arange(10) > 6
+    now = places(estimate=np.where(gone, np.nan, 0.1)).assign(z=np.where(gone, np.nan, 2.0))
+    found = changes(places(), now, 0.02)
+    assert (found.lost, found.compared, len(found.worse)) == (3, 7, 0)
+    assert found.length == pytest.approx(6.5)
+
+
+@given(
+    st.lists(st.floats(0.0, 1.0), min_size=10, max_size=10),
+    st.lists(st.floats(0.0, 1.0), min_size=10, max_size=10),
+    st.permutations(range(10)),
+)
+def test_worse_and_better_change_places_with_the_maps(
+    one: list[float], other: list[float], order: list[int]
+) -> None:
+    a, b = places(estimate=one), places(estimate=other).iloc[order]
+    there, back = changes(a, b, 0.02), changes(b, a, 0.02)
+    assert set(there.worse["arc_length"]) == set(back.better["arc_length"])
+    assert set(there.better["arc_length"]) == set(back.worse["arc_length"])
+    assert there.worse["length"].sum() + there.better["length"].sum() <= there.length + 1e-9
 
 
 def test_stores_without_estimates_are_compared_by_tiles(two: tuple[Path, Path]) -> None:
