@@ -112,8 +112,8 @@ def status(
 def store_facts(store: TileStore) -> dict[str, Any]:
     """A tile store for machines: its state, its tiles, and what was noticed of its sources."""
     condition = store.condition()
-    packed = "scans"  # of each scan of a log, for nobody to read
-    sources = [{k: v for k, v in one.items() if k != packed} for one in store.sources()]
+    ours = ("scans", "told")  # of each scan of a log, for nobody to read; what notes have too
+    sources = [{k: v for k, v in one.items() if k not in ours} for one in store.sources()]
     return {
         "url": store.url,
         "whole": condition.whole,
