@@ -30,6 +30,8 @@ LEAST = 1e-4
 """Errors below this count as this, before a logarithm [m]."""
 POINTS_MIN = 50
 """Fewest labelled points that a model is trained on."""
+WITHOUT_DRIVES = "`tilestream estimate` and model: {recipe: physics} need no drives"
+"""What there is for whoever has nothing to learn from."""
 OF_LIDAR = ("registration", "as_sensor")
 """What of the identity of labels may differ from run to run: a model over several knows it."""
 VIRTUAL_DRIVES = ("group", "route_id", "sample", "arc_length", "status", *AVERAGED)
@@ -187,12 +189,13 @@ class Dataset:
             losses = "; ".join(f"{count} {reason}" for reason, count in self.losses.items())
             raise ModelError(
                 f"{len(self)} labelled points, and a model needs {POINTS_MIN}: localize a longer "
-                f"drive, or more of them (lost: {losses or 'none'})"
+                f"drive, or more of them (lost: {losses or 'none'}); {WITHOUT_DRIVES}"
             )
         label = self.label(target)
         if label.min() == label.max():
             raise ModelError(
-                f"{target} is {label[0]:g} at all {len(self)} points: nothing to learn"
+                f"{target} is {label[0]:g} at all {len(self)} points: nothing to learn from; "
+                f"{WITHOUT_DRIVES}"
             )
         sizes = self.rows.groupby("path")["arc_length"].nunique()
         for path, size in sizes.items():

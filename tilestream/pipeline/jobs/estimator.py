@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from tilestream.errors import ModelError
-from tilestream.model.dataset import POINTS_MIN
+from tilestream.model.dataset import POINTS_MIN, WITHOUT_DRIVES
 from tilestream.model.file import load_model
 from tilestream.model.registry import UNTRAINED
 from tilestream.model.shipped import SHIPPED, file_of, is_shipped
@@ -50,7 +50,8 @@ def estimator_of(settings: RunSettings, labelled: int) -> Estimator:
     if labelled >= POINTS_MIN or settings.observe is None:
         return Estimator(trained=True)
     few = f"{labelled} labels, {POINTS_MIN} are needed to train {model.recipe}"
-    more = "to train, measure longer drives, or more of them, or places nearer to each other"
+    more = "to train, measure longer drives, or more of them, or places nearer to each other; "
+    more += WITHOUT_DRIVES
     unfit = _unfit(settings)
     if unfit:
         told = f"the estimates are the virtual drive as it is (model {UNTRAINED}), since {unfit}"

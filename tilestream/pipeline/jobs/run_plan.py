@@ -12,7 +12,7 @@ from tilestream.factors.own import own_factors
 from tilestream.from_above import tiles_around
 from tilestream.grid import MM_PER_M, TileGrid, TileKey
 from tilestream.model.baselines import Median
-from tilestream.model.dataset import TARGETS
+from tilestream.model.dataset import TARGETS, WITHOUT_DRIVES
 from tilestream.model.evaluation import factor_sets
 from tilestream.model.features import features_of
 from tilestream.model.forest import PaperForest
@@ -68,7 +68,8 @@ def plan_measure(settings: RunSettings, inputs: Inputs, map_plan: MapPlan) -> Pl
 
     Raises:
         SourceNotFoundError: there is no such log.
-        SourceError, TileNotReadyError: no drive can be measured; says why the first cannot.
+        SourceError, TileNotReadyError: no drive can be measured; says why the first cannot, and
+            what needs none.
     """
     tables = f"{settings.out}/tables"
     places = samples_along(map_plan.store, inputs.routes, settings.spacing)
@@ -120,7 +121,9 @@ def _localized(
         except (SourceError, TileNotReadyError, OSError) as error:
             errors[f"drive {drive.group}"] = error
     if errors and not plans:
-        raise next(iter(errors.values()))
+        first = next(iter(errors.values()))
+        kind = SourceError if isinstance(first, OSError) else type(first)
+        raise kind(f"{first}; no drive is left to learn from: {WITHOUT_DRIVES}") from first
     return plans, {name: str(error) for name, error in errors.items()}
 
 

@@ -6,14 +6,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from pydantic import AfterValidator, Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
 
 from tilestream.bounded_yaml import parse_yaml, read_yaml
 from tilestream.config import Settings
 from tilestream.errors import SourceNotFoundError, UsageError, foreign_errors
 from tilestream.files import Files, local_path, place_of
 from tilestream.matcher import RegistrationSettings, matcher_named
-from tilestream.model.dataset import POINTS_MIN
+from tilestream.model.dataset import POINTS_MIN, WITHOUT_DRIVES
 from tilestream.model.registry import DEFAULT, OF_VIRTUAL_DRIVES, REGRESSORS, UNTRAINED
 from tilestream.model.shipped import SHIPPED
 from tilestream.settings import (
@@ -115,6 +115,12 @@ class RunSettings(PlaceSettings):
     report: ReportSettings = ReportSettings()
     """What is reported."""
 
+    @field_validator("drives", "routes", mode="before")
+    @classmethod
+    def _emptied(cls, values: Any) -> Any:
+        """A key of YAML whose list is commented out holds nothing."""
+        return () if values is None else values
+
     @model_validator(mode="before")
     @classmethod
     def _cells_of_the_matcher(cls, values: Any) -> Any:
@@ -156,8 +162,7 @@ class RunSettings(PlaceSettings):
         recipe, use = self.model.recipe, self.model.use
         if not (self.simulate or self.drives or use or recipe == UNTRAINED):
             raise ValueError(
-                "has nothing to learn from: give drives, simulate, or model.use; `tilestream "
-                f"estimate` and model: {{recipe: {UNTRAINED}}} need no drives"
+                f"has nothing to learn from: give drives, simulate, or model.use; {WITHOUT_DRIVES}"
             )
         if recipe in OF_VIRTUAL_DRIVES and self.observe is None and not use:
             others = ", ".join(name for name in REGRESSORS if name not in OF_VIRTUAL_DRIVES)

@@ -15,7 +15,7 @@ from tilestream.factors.own import OWN, columns_in
 from tilestream.factors.rows import PLACE_COLUMNS, STATUS_COLUMNS, Samples
 from tilestream.factors.virtual_drive import MOMENT_COLUMNS
 from tilestream.marks import Mark, hash_of
-from tilestream.model.dataset import VIRTUAL_DRIVES, Dataset
+from tilestream.model.dataset import VIRTUAL_DRIVES, WITHOUT_DRIVES, Dataset
 from tilestream.model.features import features_of
 from tilestream.model.join import join
 from tilestream.pipeline.engine.outputs import Facts, Made, Parquet, Stored
@@ -119,7 +119,10 @@ class DatasetFile(Parquet):
         if mark.status == "damaged":
             raise DamagedError(mark.reason)
         if mark.status != "done":
-            raise SourceNotFoundError(f"{self.path}: no dataset; the job that joins it has not run")
+            raise SourceNotFoundError(
+                f"{self.path}: no dataset: a job with drives makes one (`tilestream run`), as far "
+                f"as it has run; {WITHOUT_DRIVES}"
+            )
         return _dataset(self, mark.identity)
 
     def _beside(self, name: str) -> str:
