@@ -1,6 +1,9 @@
 """What a map update changes."""
 
+import contextlib
 import json
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +18,7 @@ import tilestream as ts
 from tilestream.apps.changes import NOTHING, changes
 from tilestream.apps.diff import diff
 from tilestream.cli import run
-from tilestream.errors import StoreNotFoundError, UsageError
+from tilestream.errors import DamagedError, StoreNotFoundError, UsageError
 from tilestream.factors.rows import PLACE_COLUMNS
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.marks import Mark
@@ -164,3 +167,103 @@ def test_the_command_tells_people_and_machines(
     assert "1_0" in told["changed"]
     assert run(["diff", str(two[0]), str(two[1])]) == 0
     assert "got worse" in capsys.readouterr().out
+
+
+# --- Where the maps are
+
+
+@pytest.fixture(scope="module")
+def made_once(two: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """`project/` with a store of each map and an estimate on each, which was asked for with paths
+    that are relative to where one was then.
+    """
+    project = tmp_path_factory.mktemp("made") / "project"
+    (project / "maps").mkdir(parents=True)
+    (project / "runs").mkdir()
+    for name, made_before in zip(("old", "new"), two, strict=True):
+        shutil.copytree(made_before / "map.zarr", project / "maps" / f"{name}.zarr")
+    (project / "r.csv").write_text("x,y\n4,0\n16,0\n")
+    with contextlib.chdir(project / "runs"):
+        for name in ("old", "new"):
+            how = {"model": "physics", "spacing": 6.0}
+            ts.estimate(f"../maps/{name}.zarr", project / "r.csv", out=name, **how)
+    return project
+
+
+@pytest.fixture
+def runs(made_once: Path) -> Iterator[Path]:
+    """The project as it was made, at the place where it was made."""
+    kept = made_once.with_name("kept")
+    if not kept.exists():
+        shutil.copytree(made_once, kept)
+    yield made_once
+    shutil.rmtree(made_once, ignore_errors=True)
+    shutil.copytree(kept, made_once)
+
+
+def compared(old: Path, new: Path) -> tuple[object, ...]:
+    found = diff(old, new)
+    return found.changed, found.added, found.same, found.compared, dict(found.gone)
+
+
+def test_the_map_of_a_run_is_found_wherever_they_went(runs: Path, tmp_path: Path) -> None:
+    usual = compared(runs / "runs" / "old", runs / "runs" / "new")
+    assert usual[0], "a tile has changed"
+    assert usual[1:3] == (diff(runs / "maps" / "old.zarr", runs / "maps" / "new.zarr").added, 2)
+    assert usual[3:] == (3, {})
+    assert diff(runs / "runs" / "old", runs / "runs" / "new").notes == {}
+
+    link = tmp_path / "link"  # from which `../..` leads elsewhere
+    link.symlink_to(runs / "runs" / "old")
+    assert compared(link, runs / "runs" / "new") == usual
+
+    moved = tmp_path / "archive" / "2026" / "old"  # the run directory alone
+    moved.parent.mkdir(parents=True)
+    (runs / "runs" / "old").rename(moved)
+    assert compared(moved, runs / "runs" / "new") == usual
+    (told,) = diff(moved, runs / "runs" / "new").notes[str(moved)]
+    assert str(runs / "maps" / "old.zarr") in told
+
+    runs.rename(tmp_path / "renamed")  # a project as a whole
+    there = tmp_path / "renamed" / "runs" / "new"
+    assert compared(there, there)[2:] == (usual[2] + len(usual[0]) + len(usual[1]), 3, {})
+
+
+def test_tables_that_moved_are_of_the_map_that_they_were_made_on(runs: Path) -> None:
+    """With settings that name no store: of a job that made its own map, then of none."""
+    both = runs / "runs" / "old", runs / "runs" / "new"
+    usual = compared(*both)
+    for run_dir in both:
+        (run_dir / "config.yaml").unlink()
+    assert compared(*both) == usual
+    shutil.move(runs / "maps" / "old.zarr", both[0] / "map.zarr")
+    assert compared(*both) == usual
+
+
+def test_estimates_are_compared_where_a_map_is_gone(
+    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old, new = runs / "runs" / "old", runs / "runs" / "new"
+    usual = diff(old, new, worse=0.0)
+    shutil.rmtree(runs / "maps" / "old.zarr")
+    found = diff(old, new, worse=0.0)
+    assert list(found.gone) == [str(old)]
+    assert str(runs / "maps" / "old.zarr") in found.gone[str(old)]
+    assert (found.changed, found.same, found.compared) == ((), 0, 3)
+    pd.testing.assert_frame_equal(found.worse, usual.worse)
+
+    assert run(["diff", str(old), str(new), "--json"]) == 1
+    told = capsys.readouterr()
+    facts = json.loads(told.out)
+    assert (facts["changed"], facts["same"], facts["compared"]) == (None, None, 3)
+    assert str(runs / "maps" / "old.zarr") in told.err
+    with pytest.raises(StoreNotFoundError, match=r"old\.zarr"):
+        diff(old, runs / "maps" / "new.zarr")  # which has no estimates
+    (old / "map.zarr").symlink_to(runs / "maps" / "new.zarr")
+    assert diff(old, new).gone == {}, "a link says where it is"
+
+
+def test_settings_that_are_damaged_are_named(runs: Path) -> None:
+    (runs / "runs" / "old" / "config.yaml").write_text("map: {store")
+    with pytest.raises(DamagedError, match=r"config\.yaml"):
+        diff(runs / "runs" / "old", runs / "runs" / "new")

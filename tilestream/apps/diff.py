@@ -2,20 +2,21 @@
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import pandas as pd
 
 from tilestream.apps.changes import Changes, changes
 from tilestream.apps.runs import places_of
 from tilestream.crs import require_same
-from tilestream.errors import UsageError
+from tilestream.errors import StoreNotFoundError, UsageError
 from tilestream.files import Files
 from tilestream.grid import TileKey
 from tilestream.notes import Notes, noticed
 from tilestream.pipeline.jobs.run_before import REPORT, before_update, told_in
-from tilestream.pipeline.jobs.run_folder import map_of
+from tilestream.pipeline.jobs.run_folder import map_of, stores_named
 from tilestream.pipeline.jobs.sources import map_notes
+from tilestream.store import TileStore
 
 WORSE = 0.02
 """Estimates that grew by more than this count as worse [m]."""
@@ -40,7 +41,10 @@ class MapDiff:
     limit: float
     """Estimates that grew or fell by more than this count as worse or better [m]."""
     notes: Notes
-    """What was noticed of the sources of both maps, by source."""
+    """What was noticed of the sources of both maps, and of where these were found, by source."""
+    gone: Mapping[str, str] = field(default_factory=dict)
+    """Runs whose map is gone, and where it was looked for: then no tiles are compared (`added`,
+    `removed` and `changed` are empty, `same` is 0), and estimates only."""
 
     @property
     def worse(self) -> pd.DataFrame:
@@ -64,13 +68,13 @@ def diff(
     """Compare two maps, and their estimates where both have some: what got worse, where and why.
 
     Args:
-        old: a run directory (with estimates) or a tile store.
+        old: a run directory (with estimates), whose map is found wherever it lies, or a tile store.
         new: likewise; None: the run `old` as it is now, with what it was before its map was last
             updated.
         worse: estimates that grew by more than this are worse, that fell by more better [m].
 
     Raises:
-        StoreNotFoundError: nothing there.
+        StoreNotFoundError: nothing there; or a run's map is gone, and not both have estimates.
         UsageError: tiles of different size, which cannot be compared, or one run whose map was not
             updated.
         CrsError: maps in two CRS.
@@ -81,25 +85,18 @@ def diff(
     """
     before = _was(old) if new is None else _is(old)
     after = _is(old if new is None else new)
-    if before.tile_size != after.tile_size:
-        raise UsageError(
-            f"{before.named} has tiles of {before.tile_size:g} m and {after.named} of "
-            f"{after.tile_size:g} m: compare maps of one tile size"
-        )
-    require_same(before.named, before.crs, after.named, after.crs)
-    had, has = before.tiles, after.tiles
-    both = sorted(set(had) & set(has))
+    gone = {side.named: side.gone for side in (before, after) if side.gone}
+    if gone and (before.places is None or after.places is None):
+        raise StoreNotFoundError("; ".join(gone.values()))
     told = {}
     if before.settings and after.settings and before.settings != after.settings:
         told = {after.named: [OTHERWISE]}
     return MapDiff(
-        tuple(sorted(set(has) - set(had))),
-        tuple(sorted(set(had) - set(has))),
-        tuple(key for key in both if had[key] != has[key]),
-        sum(had[key] == has[key] for key in both),
+        *(((), (), (), 0) if gone else _tiles(before, after)),
         changes(before.places, after.places, worse),
         worse,
         noticed(before.notes, after.notes, told),
+        gone,
     )
 
 
@@ -114,19 +111,26 @@ class _Side:
     places: pd.DataFrame | None
     notes: Notes
     settings: str = ""
+    gone: str = ""
+    """Why its map is not there; then it has no tiles."""
 
 
 def _is(place: str | os.PathLike[str]) -> _Side:
     """A run or a store as it is."""
-    store, told = map_of(place), told_in(Files.at(place).under(REPORT))
+    named, told = os.fspath(place), told_in(Files.at(place).under(REPORT))
+    places, settings = _estimates(place), "" if told is None else told.settings
+    try:
+        store = map_of(place)
+    except StoreNotFoundError as error:
+        return _Side(named, 0.0, None, {}, places, {}, settings, str(error))
     return _Side(
         store.url,
         store.settings.tile_size,
         store.settings.crs,
         store.identities(),
-        _estimates(place),
-        map_notes(store),
-        "" if told is None else told.settings,
+        places,
+        noticed({named: _moved(named, store)}, map_notes(store)),
+        settings,
     )
 
 
@@ -135,6 +139,34 @@ def _was(place: str | os.PathLike[str]) -> _Side:
     told, places = before_update(Files.at(place))
     named = f"{place}, before"
     return _Side(named, told.tile_size, told.crs, told.keys, places, {}, told.settings)
+
+
+def _moved(place: str, found: TileStore) -> list[str]:
+    """A note where a map was not where it is looked for first."""
+    named = stores_named(place)
+    if not named or named[0] == found.url:
+        return []
+    return [f"its map is taken from {found.url}; there is none at {named[0]}"]
+
+
+def _tiles(
+    before: _Side, after: _Side
+) -> tuple[tuple[TileKey, ...], tuple[TileKey, ...], tuple[TileKey, ...], int]:
+    """Which tiles are added, removed and changed, and how many are the same."""
+    if before.tile_size != after.tile_size:
+        raise UsageError(
+            f"{before.named} has tiles of {before.tile_size:g} m and {after.named} of "
+            f"{after.tile_size:g} m: compare maps of one tile size"
+        )
+    require_same(before.named, before.crs, after.named, after.crs)
+    had, has = before.tiles, after.tiles
+    both = sorted(set(had) & set(has))
+    return (
+        tuple(sorted(set(has) - set(had))),
+        tuple(sorted(set(had) - set(has))),
+        tuple(key for key in both if had[key] != has[key]),
+        sum(had[key] == has[key] for key in both),
+    )
 
 
 def _estimates(place: str | os.PathLike[str]) -> pd.DataFrame | None:

@@ -211,11 +211,15 @@ def diff(
     found = map_diff.diff(old, new, worse=worse)
     if as_json:
         print_json(diff_facts(found))
-        return
-    out.print(diff_table(found))
-    if len(found.places.stretches):
-        out.print(stretch_table(found))
-    say_notes(found.notes)
+    else:
+        out.print(diff_table(found))
+        if len(found.places.stretches):
+            out.print(stretch_table(found))
+        say_notes(found.notes)
+    if found.gone:
+        raise PartialError(
+            "no tiles are compared, estimates only; a map is gone:", dict(found.gone)
+        )
 
 
 def print_sources(store: TileStore) -> None:

@@ -231,8 +231,9 @@ def diff_table(found: MapDiff) -> Table:
     for kind in TILE_CHANGES:
         keys = [str(key) for key in getattr(found, kind)]
         more = " …" if len(keys) > 10 else ""
-        table.add_row(f"tiles {kind}", f"{len(keys):,}", " ".join(keys[:10]) + more)
-    table.add_row("tiles the same", f"{found.same:,}", "")
+        count = "not compared" if found.gone else f"{len(keys):,}"
+        table.add_row(f"tiles {kind}", count, " ".join(keys[:10]) + more)
+    table.add_row("tiles the same", "not compared" if found.gone else f"{found.same:,}", "")
     places = found.places
     table.add_row("compared", distance(places.length), f"{places.compared:,} sample points")
     by = f"by more than {cm(found.limit, 0)}"
@@ -261,12 +262,15 @@ def stretch_table(found: MapDiff) -> Table:
 
 
 def diff_facts(found: MapDiff) -> dict[str, Any]:
-    """The same for machines."""
+    """The same for machines: null for what could not be compared."""
     places = found.places
     tables = {name: getattr(places, name) for name in ("worse", "better", "stretches")}
+    tiles: dict[str, Any] = dict.fromkeys((*TILE_CHANGES, "same"))
+    if not found.gone:
+        tiles = {kind: [str(key) for key in getattr(found, kind)] for kind in TILE_CHANGES}
+        tiles["same"] = found.same
     return {
-        **{kind: [str(key) for key in getattr(found, kind)] for kind in TILE_CHANGES},
-        "same": found.same,
+        **tiles,
         "compared": places.compared,
         "compared_m": places.length,
         "limit": found.limit,
@@ -274,6 +278,7 @@ def diff_facts(found: MapDiff) -> dict[str, Any]:
         "better_m": float(places.better["length"].sum()),
         "lost": places.lost,
         "notes": found.notes,
+        "gone": found.gone,
         **{name: rows.to_dict("records") for name, rows in tables.items()},
     }
 
