@@ -4,7 +4,7 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -24,11 +24,17 @@ def certificates(folder: Path) -> TlsFiles:
 
 @contextmanager
 def scheduler_elsewhere(
-    workers: int, tls: TlsFiles | None = None, *, plain: bool = False
+    workers: int,
+    tls: TlsFiles | None = None,
+    *,
+    plain: bool = False,
+    prefixes: Sequence[Sequence[str]] = (),
+    of_workers: Mapping[str, str] | None = None,
 ) -> Iterator[tuple[str, list["subprocess.Popen[bytes]"]]]:
     """Address and processes of a scheduler in another process, and of its workers.
 
-    With nannies and a dashboard, which a `plain` one goes without: it starts sooner.
+    With nannies and a dashboard, which a `plain` one goes without: it starts sooner. `prefixes` are
+    the commands that start the workers; `of_workers` is in their environment, empty: it is not.
     """
     flags = [] if tls is None else ["--tls-ca-file", tls.ca, "--tls-cert", tls.cert]
     flags += [] if tls is None else ["--tls-key", tls.key]
@@ -43,8 +49,12 @@ def scheduler_elsewhere(
     commands = [[*program, *common, "--port", str(port), *shown]]
     program = [sys.executable, "-m", "distributed.cli.dask_worker"]
     one = ["--nthreads", "1", "--no-dashboard", *(["--no-nanny"] if plain else [])]
-    commands += [[*program, address, *common, *one]] * workers
+    for number in range(workers):
+        begun_by = prefixes[number] if prefixes else ()
+        commands.append([*begun_by, *program, address, *common, *one])
     environment = {**os.environ, **ONE_THREAD, "PYTHONPATH": str(Path(__file__).parent)}
+    environment |= of_workers or {}
+    environment = {name: value for name, value in environment.items() if value}
     processes = [
         subprocess.Popen(
             command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL

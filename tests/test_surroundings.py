@@ -6,6 +6,8 @@ import os
 import subprocess
 import sys
 import uuid
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,6 +16,8 @@ import distributed
 import numpy as np
 import pytest
 import zarr
+from elsewhere import scheduler_elsewhere
+from patience import PATIENCE
 
 import tilestream as ts
 from tilestream.errors import TaskError, UsageError
@@ -90,7 +94,7 @@ def test_a_store_that_the_workers_do_not_see_is_named_once(
     workers: distributed.Client, cloud: Path
 ) -> None:
     url = f"memory://{uuid.uuid4().hex}/map.zarr"
-    with pytest.raises(UsageError, match=r"does not see memory:///.*all workers see") as told:
+    with pytest.raises(UsageError, match=r"cannot read memory:///.*all workers see") as told:
         ts.ingest(cloud, url, client=workers)
     assert "\n" not in str(told.value)
     assert not [name for name in Files.at(url).names() if "seen" in name]
@@ -107,7 +111,7 @@ def test_a_place_that_nobody_can_write_to_may_be_seen(
     if not Path("/proc/self").exists():
         pytest.skip("needs Linux")
     require_seen(workers, ["/proc"])
-    with pytest.raises(UsageError, match="does not see /proc/nowhere:"):
+    with pytest.raises(UsageError, match="cannot read /proc/nowhere "):
         require_seen(workers, ["/proc/nowhere"])
 
 
@@ -116,7 +120,7 @@ def test_a_worker_that_is_gone_or_has_no_tilestream(tmp_path: Path) -> None:
         return SimpleNamespace(run=lambda *_, **__: answers)
 
     require_seen(client(a=OSError("gone"), b=""), [str(tmp_path)])
-    with pytest.raises(UsageError, match="worker a: No module named 'tilestream'"):
+    with pytest.raises(UsageError, match=r"worker a .*No module named 'tilestream'"):
         require_seen(client(a=ImportError("No module named 'tilestream'")), [str(tmp_path)])
     assert list(tmp_path.iterdir()) == []
 
@@ -166,3 +170,71 @@ def test_a_cluster_that_does_not_start_is_told_in_a_line(monkeypatch: pytest.Mon
         dask_client(None, 2, 10**9),
     ):
         pass
+
+
+# --- Workers elsewhere that do not see what the client sees
+
+
+@contextmanager
+def workers_elsewhere(
+    *prefixes: Sequence[str], environment: Mapping[str, str] | None = None
+) -> Iterator[distributed.Client]:
+    """A client of workers in processes of their own, each started by a command that may change
+    what it sees.
+    """
+    with (
+        scheduler_elsewhere(
+            len(prefixes), plain=True, prefixes=prefixes, of_workers=environment
+        ) as (address, _),
+        dask_client(address, None, 10**9) as client,
+    ):
+        client.wait_for_workers(len(prefixes), timeout=PATIENCE)
+        yield client
+
+
+def blind_to(folder: Path) -> list[str]:
+    """The command of a process in front of whose folder another one is mounted."""
+    mount = f'mount -t tmpfs none {folder} && exec "$@"'
+    command = ["unshare", "--mount", "--map-root-user", "sh", "-c", mount, "sh"]
+    tried = subprocess.run([*command, "true"], capture_output=True, check=False)
+    if tried.returncode:
+        pytest.skip("needs a mount namespace of its own")
+    return command
+
+
+def test_workers_without_credentials_are_named_with_what_they_lack(
+    cloud: Path, s3_bucket: str
+) -> None:
+    store = ts.ingest(cloud, f"{s3_bucket}/map.zarr")
+    lacking = {name: "" for name in os.environ if name.startswith("AWS_") and "KEY" in name}
+    assert lacking
+    nowhere = {"AWS_EC2_METADATA_DISABLED": "true", "HOME": "/nowhere"}
+    with workers_elsewhere([], [], environment={**lacking, **nowhere}) as client:
+        with pytest.raises(UsageError) as told:
+            ts.ingest(cloud, store.url, client=client)
+        named = list(client.scheduler_info()["workers"])
+    text = str(told.value)
+    assert all(worker in text for worker in named)
+    assert f"cannot read {store.url} (" in text
+    assert "credentials" in text.split("): ")[1]
+    assert "\n" not in text
+    assert not [name for name in Files.at(store.url).names() if "seen" in name]
+
+
+def test_a_worker_that_does_not_see_a_folder_or_a_source_is_named(
+    cloud: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "shared").mkdir()
+    (tmp_path / "mine").mkdir()
+    cloud = cloud.rename(tmp_path / "mine" / "cloud.pcd")
+    store = str(tmp_path / "shared" / "map.zarr")
+    for hidden, lacks in (("shared", store), ("mine", str(cloud))):
+        with workers_elsewhere([], blind_to(tmp_path / hidden)) as client:
+            with pytest.raises(UsageError) as told:
+                ts.ingest(cloud, store, client=client)
+            pids = client.run(os.getpid)
+        text = str(told.value)
+        assert f"cannot read {lacks} (" in text
+        assert sum(worker in text for worker in pids) == 1
+        assert "mount it there under the same name" in text
+    assert not (tmp_path / "shared" / "map.zarr" / "tiles").exists()

@@ -24,6 +24,8 @@ PART = re.compile(r"^\..*\.[0-9a-f]{32}\.part$")
 """The name of a file while it is being written."""
 URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)(?:::[A-Za-z0-9+.:-]+)?:(//?)")
 """How a URL begins, maybe one of fsspec's chains; a single letter is a drive of Windows."""
+SECRET = re.compile(r"(?<=://)[^/@\s]*:[^/@\s]*@|\?.*$")
+"""What of a URL may be nobody's business: user and password, a query with a signature."""
 ON_DISK = ("file", "local")
 """The protocols of this machine's own files."""
 
@@ -61,6 +63,16 @@ def place_of(url: str | os.PathLike[str]) -> str:
         return text.rstrip("/")
     head, up, tail = f"{path}{os.sep}".rpartition(f"{os.pardir}{os.sep}")
     return os.path.abspath(os.path.join(os.path.realpath(head + up), tail) if up else path)  # noqa: PTH100, PTH118
+
+
+def without_secrets(place: str) -> str:
+    """A place as it may be shown to anyone: of a URL without user, password and query.
+
+    Examples:
+        >>> without_secrets("sftp://me:word@host/map.zarr")
+        'sftp://…host/map.zarr'
+    """
+    return SECRET.sub("…", place) if "://" in place else place
 
 
 def _local(text: str) -> str | None:

@@ -4,7 +4,7 @@ import logging
 import queue
 import time
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -48,10 +48,20 @@ class DaskNames:
 
 
 def run_on_dask(
-    frontier: Frontier, client: Any, names: DaskNames, memory: int, patience: float
+    frontier: Frontier,
+    client: Any,
+    names: DaskNames,
+    memory: int,
+    patience: float,
+    meet: Callable[[Sequence[str]], None],
 ) -> Iterator[Outcome]:
-    """The outcomes of all tasks as they end, with a bounded number of them at Dask at any time."""
-    workers = _Workers(client, patience)
+    """The outcomes of all tasks as they end, with a bounded number of them at Dask at any time.
+
+    `meet` is called with the addresses of workers before they are counted on, and raises what is
+    wrong with them: one that fails at once would take one task after the other.
+    """
+    workers = _Workers(client, patience, meet)
+    workers.threads()
     workers.wait_for_orphans()
     submit = _Submitter(client, names, memory)
     running: dict[str, tuple[Task, Any]] = {}
@@ -137,9 +147,11 @@ def _outcome(task: Task, future: Any, workers: "_Workers") -> Outcome | None:
 class _Workers:
     """The workers of a scheduler: how many threads they have, and whether anybody is there."""
 
-    def __init__(self, client: Any, patience: float) -> None:
+    def __init__(self, client: Any, patience: float, meet: Callable[[Sequence[str]], None]) -> None:
         self._client = client
         self._patience = patience
+        self._meet = meet
+        self._met: set[str] = set()
         self._address = client.scheduler.address
         self._threads = 0
         self._asked = -LOOK_EVERY
@@ -150,6 +162,7 @@ class _Workers:
 
         Raises:
             TaskError: the scheduler is lost, or has had no worker for longer than the patience.
+            UsageError: a new one cannot be used.
         """
         now = time.monotonic()
         if now - self._asked < LOOK_EVERY:
@@ -159,6 +172,10 @@ class _Workers:
             found = self._client.sync(self._client.scheduler.ncores, callback_timeout=ANSWER_WITHIN)
         except (OSError, TimeoutError, CommClosedError):
             raise self._lost() from None
+        new = sorted(set(found) - self._met)
+        if new:
+            self._met.update(new)
+            self._meet(new)
         self._asked, self._threads = now, sum(found.values())
         if self._threads:
             self._seen = now

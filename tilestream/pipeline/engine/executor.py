@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
+from functools import partial
 from typing import Any
 
 from tilestream.pipeline.engine.attempt import Outcome, attempt
@@ -30,6 +31,7 @@ def execute(
     *,
     grow: Grow | None = None,
     shared: Sequence[str] = (),
+    inputs: Sequence[str] = (),
     retries: int = RETRIES,
     patience: float = PATIENCE,
 ) -> list[Outcome]:
@@ -44,7 +46,8 @@ def execute(
         client: a Dask client; None: one by one in this process.
         watch: is told of each outcome.
         grow: adds tasks to the plan while it runs.
-        shared: folders and stores that all workers must see.
+        shared: folders and stores that all workers must see, also those that come later.
+        inputs: files that they all must see.
         retries: how often a task is tried again.
         patience: how long to wait for a worker while the scheduler has none [s].
 
@@ -58,7 +61,6 @@ def execute(
     """
     if client is not None:
         require_blocking(client)
-        require_seen(client, shared)
     frontier, names = Frontier(retries), DaskNames()
     work: dict[str, int] = {}
     total: Counter[str] = Counter()
@@ -68,7 +70,8 @@ def execute(
         if client is None:
             running, page = _run_here(frontier, plan.memory), None
         else:
-            running = run_on_dask(frontier, client, names, plan.memory, patience)
+            meet = partial(require_seen, client, shared, inputs)
+            running = run_on_dask(frontier, client, names, plan.memory, patience, meet)
             page = stack.enter_context(dashboard_client(client, names))
 
         def add(tasks: Iterable[Task]) -> None:

@@ -6,10 +6,13 @@ from contextlib import suppress
 from typing import Any
 
 from tilestream.errors import UsageError
-from tilestream.files import Files
+from tilestream.files import Files, without_secrets
 
-ANSWER_WITHIN = 30.0
-"""How long workers may take to look before the run goes on without their answer [s]."""
+ANSWER_WITHIN = 120.0
+"""How long workers may take to look before the run goes on without their answer [s]: a new one
+imports this package first, from the disk of a busy machine maybe."""
+NAMED = 3
+"""Workers that are named of those that have one trouble; of the others the number."""
 
 
 def require_blocking(client: Any) -> None:
@@ -24,34 +27,68 @@ def require_blocking(client: Any) -> None:
         )
 
 
-def require_seen(client: Any, places: Sequence[str]) -> None:
+def require_seen(
+    client: Any,
+    places: Sequence[str],
+    inputs: Sequence[str] = (),
+    workers: Sequence[str] | None = None,
+) -> None:
     """Refuse workers that do not see the places in which they are to work.
 
-    A small file is written to each and read by every worker that is there now; of a place where
-    none can be written, it is looked whether it is there.
+    A small file is written to each and read by every worker; of a place where none can be written,
+    and of an input, it is looked whether it is there.
 
     Args:
         client: a Dask client.
         places: folders and stores, made by now: local paths or fsspec URLs.
+        inputs: files and stores that are there, and only read; of those of one kind in one folder
+            one is looked at.
+        workers: addresses of those that are asked; None: all that are there now.
 
     Raises:
-        UsageError: a worker does not find it, or has no tilestream; says which and where.
+        UsageError: some do not find it, or have no tilestream; says which, what, and what to do.
     """
     probe = f".seen-{uuid.uuid4().hex}"
     files = [Files.at(place).under(probe) for place in dict.fromkeys(places)]
     try:
         told = {file.parent.address: _written(file, probe) for file in files}
-        answers = _answers(client, told)
+        told |= {place: "" for place in _some_of(inputs) if place not in told}
+        answers = _answers(client, told, workers)
     finally:
         for file in files:
             with suppress(OSError):
                 file.remove()
+    blind: dict[str, list[str]] = {}
     for worker, answer in sorted(answers.items()):
         if answer and not isinstance(answer, OSError):  # which says that this worker is gone
-            raise UsageError(
-                f"worker {worker}: {answer}: inputs, stores and run directories must lie where all "
-                "workers see them under the same name, and all workers need tilestream"
-            )
+            blind.setdefault(_told(answer), []).append(worker)
+    for reason, those in blind.items():
+        more = f" and {len(those) - NAMED} more" if len(those) > NAMED else ""
+        many = "workers" if len(those) > 1 else "worker"
+        raise UsageError(f"{many} {', '.join(those[:NAMED])}{more} {reason}")
+
+
+def _some_of(inputs: Sequence[str]) -> list[str]:
+    """One of each kind in each folder: of a city's blocks there are thousands."""
+    folder_and_ending = {(p.rpartition("/")[0], p.rpartition(".")[2]): p for p in inputs}
+    return list(folder_and_ending.values())
+
+
+def _told(answer: tuple[str, str] | Exception) -> str:
+    """What keeps a worker from its work, and what to do about it."""
+    if isinstance(answer, Exception):
+        return f"cannot work ({answer}): all workers need tilestream, of the client's version"
+    place, why = answer
+    shown = without_secrets(place)
+    do = (
+        "start them with the credentials and settings of this store that the client has"
+        if "://" in place
+        else "mount it there under the same name"
+    )
+    return (
+        f"cannot read {shown} ({why.replace(place, shown)}): {do}; inputs, stores and run "
+        "directories must lie where all workers see them"
+    )
 
 
 def _written(file: Files, probe: str) -> str:
@@ -63,25 +100,27 @@ def _written(file: Files, probe: str) -> str:
     return probe
 
 
-def _answers(client: Any, probes: Mapping[str, str]) -> dict[str, Any]:
+def _answers(
+    client: Any, probes: Mapping[str, str], workers: Sequence[str] | None
+) -> dict[str, Any]:
     """What `_look` says, by worker; of one that cannot run it the exception; nothing where the
     workers are busy, or the scheduler is lost, which the run finds out itself.
     """
+    how = {"on_error": "return", "callback_timeout": ANSWER_WITHIN}
     try:
-        found = client.run(_look, probes, on_error="return", callback_timeout=ANSWER_WITHIN)
-        return dict(found)
+        return dict(client.run(_look, probes, workers=workers, **how))
     except (TimeoutError, OSError):
         return {}
 
 
-def _look(probes: Mapping[str, str]) -> str:
-    """Why a worker does not see a place; empty: it sees them all."""
+def _look(probes: Mapping[str, str]) -> tuple[str, str] | None:
+    """The first place that a worker does not see, and why; None: it sees them all."""
     for place, probe in probes.items():
         try:
             where = Files.at(place)
             seen = where.under(probe).read() == probe.encode() if probe else where.there()
         except Exception as error:  # noqa: BLE001 - whatever keeps it from seeing
-            return f"does not see {place} ({type(error).__name__}: {error})"
+            return place, f"{type(error).__name__}: {error}"
         if not seen:
-            return f"sees another {place}" if probe else f"does not see {place}"
-    return ""
+            return place, "another one is there" if probe else "nothing is there"
+    return None

@@ -90,6 +90,7 @@ def ingest(
             watch,
             grow=lambda outcome: reading.grown(outcome) or (),
             shared=[reading.store.url],
+            inputs=reading.inputs,
         )
         failures = reading.close(outcomes)
     if failures:

@@ -107,7 +107,9 @@ def make_tables(
     with only_writer(out):
         announce(plan.tasks)
         stores = [t.writes.store_url for t in plan.tasks if isinstance(t.writes, TileArrays)]
-        outcomes = execute(plan, client, watch, shared=[place_of(out), *stores])
+        inputs = [source for task in plan.tasks for source in _sources_of(task)]
+        shared = [place_of(out), *dict.fromkeys(stores)]
+        outcomes = execute(plan, client, watch, shared=shared, inputs=inputs)
         failures = {outcome.key: outcome.reason for outcome in outcomes if not outcome.ok}
         settle(plan.tasks, failures)
     return failures

@@ -104,6 +104,11 @@ class Reading:
         return Plan(tasks, self._memory)
 
     @property
+    def inputs(self) -> list[str]:
+        """The files that are read; none where the map is current."""
+        return [] if self.current else [one.path for one in self.found if not one.reason]
+
+    @property
     def left_out(self) -> dict[str, str]:
         """The sources that could not be read, and why."""
         return {source.path: source.reason for source in self.found if source.reason}

@@ -6,6 +6,7 @@ from typing import Any
 import joblib
 
 from tilestream.files import Files
+from tilestream.model.shipped import SHIPPED
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.plan import Plan, paths_of
@@ -64,6 +65,14 @@ class Story:
     def places(self) -> int:
         """How many sample points the routes have."""
         return sum(task.work for task in self.measure.outputs("factors"))
+
+    @property
+    def files(self) -> list[str]:
+        """The files that tasks read: sources of the map, logs of drives, a model in use."""
+        sources = self.reading.inputs if self.reading else []
+        use = self.settings.model.use
+        model = [] if use in (None, SHIPPED) else [str(use)]
+        return [*sources, *(drive.log for drive in self.inputs.drives), *model]
 
     def first(self) -> Plan:
         """What to run first: read the sources, or measure on the map that is there."""
