@@ -175,7 +175,7 @@ def test_the_plan_makes_what_choices_share_once(
     for at, task in enumerate(plan.tasks):
         assert not set(task.needs) & set(keys[at:]), task.key
     fine = plan_compare(store, [route], tmp_path, CHOICES[:1], *how)
-    assert any(task.key.startswith("cells-2000-") for task in fine.tasks)  # the usual map's size
+    assert not any(task.key.startswith("cells-2000-") for task in fine.tasks), "nobody asked"
 
 
 @pytest.mark.slow
@@ -226,17 +226,22 @@ TILES = ("0_0", "0_1", "1_0")
             st.lists(st.sampled_from(TILES), min_size=n, max_size=n),
             *[st.lists(VALUE, min_size=n, max_size=n)] * 3,
         )
-    )
+    ),
+    st.permutations((1.0, 2.0, 4.0)),
+    st.permutations((100, 200, 300)),
 )
-def test_the_cell_size_of_a_tile_is_the_largest_that_obeys_the_cap(
+def test_the_cell_size_of_a_tile_is_the_cheapest_that_obeys_the_cap(
     drawn: tuple[list[str], list[float], list[float], list[float]],
+    order: list[float],
+    counts: list[int],
 ) -> None:
     tiles, *values = drawn
     estimates = {
-        size: list(zip(tiles, of, strict=True))
-        for size, of in zip(("1.0", "2.0", "4.0"), values, strict=True)
+        str(size): list(zip(tiles, of, strict=True)) for size, of in zip(order, values, strict=True)
     }
-    (vehicle,) = made_up(estimates).cell_sizes(CAP)
+    cells = dict(zip(order, counts, strict=True))
+    (vehicle,) = made_up(estimates, cells).cell_sizes(CAP)
+    assert vehicle["baseline"] == order[0]
     assert [line["tile"] for line in vehicle["tiles"]] == sorted({*tiles, "9_9"})
     for line in vehicle["tiles"]:
         here = np.array([[v for t, v in estimates[s] if t == line["tile"]] for s in estimates])
@@ -244,23 +249,49 @@ def test_the_cell_size_of_a_tile_is_the_largest_that_obeys_the_cap(
         whole = [bool(np.isfinite(row).all()) for row in judged]
         obeys = [
             size
-            for size, row, all_there in zip((1.0, 2.0, 4.0), judged, whole, strict=True)
+            for size, row, all_there in zip(order, judged, whole, strict=True)
             if judged.size and all_there and np.quantile(row, 0.95) <= CAP
         ]
         assert line["places"] == here.shape[1]
         if not judged.size:
-            assert (line["cell_size"], line["suffices"], line["p95"]) == (1.0, None, None)
+            assert (line["cell_size"], line["suffices"], line["p95"]) == (order[0], None, None)
         elif obeys:
-            assert (line["cell_size"], line["suffices"]) == (max(obeys), True)
+            cheapest = min(obeys, key=lambda size: cells[size])
+            assert (line["cell_size"], line["suffices"]) == (cheapest, True)
             assert line["p95"] <= CAP
         else:
             assert line["suffices"] is False
             assert line in vehicle["over"]
-            chosen = judged[(1.0, 2.0, 4.0).index(line["cell_size"])]
+            chosen = judged[order.index(line["cell_size"])]
             fewest = min(int(np.isnan(row).sum()) for row in judged)
             assert int(np.isnan(chosen).sum()) == fewest
-    assert vehicle["cells"] == sum(round(1000 / line["cell_size"]) for line in vehicle["tiles"])
-    assert vehicle["map_bytes"] <= vehicle["finest_bytes"]
+    assert vehicle["cells"] == sum(cells[line["cell_size"]] for line in vehicle["tiles"])
+
+
+@given(st.lists(st.tuples(VALUE, VALUE), min_size=1, max_size=9))
+def test_what_a_cell_size_costs_is_the_other_way_round_for_the_other_as_baseline(
+    values: list[tuple[float, float]],
+) -> None:
+    """Neither of two sizes is favoured: which is named first decides the sign alone."""
+    small, large = ([("0_0", pair[k]) for pair in values] for k in (0, 1))
+    (one,) = made_up({"1.0": small, "2.0": large}).cell_sizes(CAP)
+    (two,) = made_up({"2.0": large, "1.0": small}).cell_sizes(CAP)
+    assert (one["baseline"], two["baseline"]) == (1.0, 2.0)
+    both = [b - a for a, b in values if np.isfinite(a) and np.isfinite(b)]
+    forth, back = one["sizes"][1], two["sizes"][1]
+    if both:
+        assert forth["change"] == pytest.approx(np.median(both)) == pytest.approx(-back["change"])
+        assert forth["worse"] == np.mean(np.array(both) > 0.0)
+        assert back["worse"] == np.mean(np.array(both) < 0.0)
+    else:
+        assert forth["change"] is back["change"] is None
+    for size in (1.0, 2.0):
+        costs = [next(s for s in v["sizes"] if s["cell_size"] == size) for v in (one, two)]
+        assert costs[0]["cells"] == costs[1]["cells"] == 2 * round(1000 / size)
+        assert costs[0]["suffices"] == costs[1]["suffices"]
+    assert {line["cell_size"] for line in one["tiles"] if line["suffices"]} == {
+        line["cell_size"] for line in two["tiles"] if line["suffices"]
+    }
 
 
 def test_where_no_size_suffices_the_best_is_taken_and_listed() -> None:
@@ -279,8 +310,10 @@ def test_where_no_size_suffices_the_best_is_taken_and_listed() -> None:
     assert (lines["9_9"]["cell_size"], lines["9_9"]["suffices"]) == (1.0, None)
     assert [line["tile"] for line in vehicle["over"]] == ["0_0", "0_1"]
     assert vehicle["map_bytes"] == (500 + 3 * 1000) * CELL_BYTES
-    assert vehicle["finest_bytes"] == 4 * 1000 * CELL_BYTES
-    assert vehicle["usual_bytes"] == 4 * 500 * CELL_BYTES
+    assert [one["map_bytes"] for one in vehicle["sizes"]] == [
+        4 * 1000 * CELL_BYTES,
+        4 * 500 * CELL_BYTES,
+    ]
     (first, *_) = comparison.differing()
     assert (first["best"], first["worst"]) == ("car-2.0", "car-1.0")
     assert first["difference"] == pytest.approx(0.19)

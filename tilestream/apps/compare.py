@@ -26,7 +26,7 @@ from tilestream.pipeline.jobs.inventory import make_tables
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.observe import Observing, observe
 from tilestream.records import Route, RouteZ
-from tilestream.report.comparison import CELL_COLUMNS, ROW_COLUMNS, USUAL, Comparison
+from tilestream.report.comparison import CELL_COLUMNS, ROW_COLUMNS, Comparison
 from tilestream.sensor import Carrier
 from tilestream.settings import LabelSettings, VirtualSettings
 from tilestream.store import TileStore, cells_table
@@ -149,7 +149,8 @@ def compare(
         routes: where; in the map's frame, each with a name of its own.
         out: folder of the tables, `<choice>/observability/<tile>.parquet`, a local path or any
             fsspec URL; other tables of these choices there are removed.
-        choices: what is compared, at least one, no two of one name.
+        choices: what is compared, at least one, no two of one name; of those that differ in the
+            cell size only, the first is the baseline of the others.
         spacing: distance between sample points [m].
         registration: the matcher of the vehicle; default `autoware`, as of all jobs.
         sensor_height: height of the lidar above the road [m].
@@ -247,9 +248,7 @@ def plan_compare(
         folder = f"{place_of(out)}/{choice.name}"
         planned = plan_observe(map_plan, samples, folder, observing, memory, group=choice.name)
         tasks += planned.outputs(observe.name)
-    usual_mm = whole_mm(USUAL, "cell_size")
-    counted = {*sizes_mm, usual_mm} if store.grid.tile_mm % usual_mm == 0 else set(sizes_mm)
-    for key, size_mm in itertools.product(sorted(map_plan.points), sorted(counted)):
+    for key, size_mm in itertools.product(sorted(map_plan.points), sizes_mm):
         map_plan.cells(key, size_mm)  # also of tiles that no route sees: the map's size
     return Plan.of((*map_plan.tasks.values(), *tasks), memory)
 

@@ -1,7 +1,9 @@
 """What a comparison of sensors, ranges and cell sizes says: of each, and where they part."""
 
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -26,8 +28,6 @@ CELL_COLUMNS = ("tile", "cell_size", "cells")
 """A row per tile of the map and cell size [m]: how many cells it has."""
 CELL_BYTES = 13 * 8
 """A cell in memory: index (3), count, mean (3), six numbers of the covariance, 8 bytes each."""
-USUAL = 2.0
-"""Cell size of the paper and of Autoware [m]: what a map of several sizes is compared with."""
 QUANTILE = 0.95
 """Of the estimates in a tile: this one must stay within the cap."""
 
@@ -46,8 +46,7 @@ class Comparison:
     choices: pd.DataFrame
     """`CHOICE_COLUMNS`."""
     cells: pd.DataFrame
-    """`CELL_COLUMNS`; of every tile of the map at every cell size of the choices, and at `USUAL`
-    where that fits the tiles."""
+    """`CELL_COLUMNS`; of every tile of the map at every cell size of the choices."""
     facts: dict[str, Any] = field(default_factory=dict)
     """How it was made: settings by name."""
     notes: Notes = field(default_factory=dict)
@@ -131,23 +130,28 @@ class Comparison:
         return [dict(plain(place)) for place in found]
 
     def cell_sizes(self, cap: float) -> list[dict[str, Any]]:
-        """For each vehicle that is compared with several cell sizes: one for each tile.
+        """For each vehicle that is compared with several cell sizes: what each costs, and one for
+        each tile.
 
-        A size suffices in a tile if it gives an estimate at every sample point there at which any
-        size does, and the 95 % quantile of its estimates stays within the cap. The largest that
-        suffices is chosen; where none does, the one that loses the fewest points and then has the
-        lowest quantile; where there is no estimate, the smallest. Each estimate is that of
-        a map of one cell size throughout.
+        No size is right by being small: the first of a vehicle's choices is its baseline, and the
+        others are compared with that. A size suffices in a tile if it gives an estimate at every
+        sample point there at which any size does, and the 95 % quantile of its estimates stays
+        within the cap. Of those that suffice the one with the fewest cells there is chosen; where
+        none does, the one that loses the fewest points and then has the lowest quantile; where
+        there is no estimate, the baseline; of equals the first. Each estimate is that of a map of
+        one cell size throughout.
 
         Args:
             cap: of the quantile [m].
 
         Returns:
-            By vehicle: `vehicle`, `tiles` (a dictionary per tile of the map: `tile`, `places`,
-            `cell_size` [m], `p95` [m] or None, `suffices`, None where nothing judges it, `cells`),
-            `over`: those tiles where no size suffices; `cells` and `map_bytes` of the map of the
-            chosen sizes, `finest_bytes` and `usual_bytes` (`USUAL`; None where that does not fit
-            the tiles) of maps of one size.
+            By vehicle: `vehicle`, `baseline` [m]; `sizes` (a dictionary per size: `cell_size` [m],
+            `cells` and `map_bytes` of a map of it alone, `change`: the median over places of its
+            estimate - the baseline's [m], None where they share none, `worse`: the share of these
+            places where that is above 0, `suffices`: in how many of the `with_estimates` tiles);
+            `tiles` (a dictionary per tile of the map: `tile`, `places`, `cell_size` [m], `p95` [m]
+            or None, `suffices`, None where nothing judges it, `cells`), `over`: those tiles where
+            no size suffices; `cells` and `map_bytes` of the map of the chosen sizes.
 
         Raises:
             UsageError: a cap that is no positive length.
@@ -161,21 +165,19 @@ class Comparison:
             sizes = dict(zip(choices["cell_size"], choices["choice"], strict=True))
             rows = self.rows[self.rows["choice"].isin(choices["choice"])]
             by_tile = dict(iter(rows.groupby("tile")))
-            tiles = [
-                {"tile": tile} | _size_of_tile(by_tile.get(tile), sizes, cap) for tile in size.index
-            ]
-            for line in tiles:
-                line["cells"] = size.loc[line["tile"], line["cell_size"]]
+            judged = {tile: _judged(by_tile.get(tile), sizes, cap) for tile in size.index}
+            tiles = [{"tile": t} | _chosen(judged[t], size.loc[t], sizes) for t in size.index]
             cells = int(sum(line["cells"] for line in tiles))
             found.append(
                 {
                     "vehicle": vehicle,
+                    "baseline": next(iter(sizes)),
+                    "sizes": _costs(rows, sizes, size, judged.values()),
+                    "with_estimates": sum(bool(one.ranked) for one in judged.values()),
                     "tiles": tiles,
                     "over": [line for line in tiles if line["suffices"] is False],
                     "cells": cells,
                     "map_bytes": cells * CELL_BYTES,
-                    "finest_bytes": int(size[min(sizes)].sum()) * CELL_BYTES,
-                    "usual_bytes": int(size[USUAL].sum()) * CELL_BYTES if USUAL in size else None,
                 }
             )
         return [dict(plain(vehicle)) for vehicle in found]
@@ -200,28 +202,72 @@ class Comparison:
         )
 
 
-def _size_of_tile(rows: pd.DataFrame | None, sizes: dict[float, str], cap: float) -> dict[str, Any]:
-    """The cell size of a tile, from the estimates at its sample points (None: it has none)."""
-    finest = {"cell_size": min(sizes), "p95": None, "suffices": None}
+class _Judged(NamedTuple):
+    """The cell sizes of a tile, by the estimates at its sample points."""
+
+    places: int
+    ranked: dict[float, tuple[int, float]]
+    """By size: places that it loses, and the quantile of its estimates; empty: nothing judges."""
+    enough: list[float]
+    """The sizes that suffice."""
+
+
+def _judged(rows: pd.DataFrame | None, sizes: dict[float, str], cap: float) -> _Judged:
+    """What the estimates of a tile (None: it has no sample points) say of each size."""
     if rows is None:
-        return {"places": 0} | finest
+        return _Judged(0, {}, [])
     estimate = _by_choice(rows, "vd_mean")
     estimated = estimate[estimate.notna().any(axis=1)]
     if estimated.empty:
-        return {"places": len(estimate)} | finest
-    ranked = []
+        return _Judged(len(estimate), {}, [])
+    ranked = {}
     for cell_size, choice in sizes.items():
         here: Float64 = estimated[choice].dropna().to_numpy(np.float64)
         p95 = float(np.quantile(here, QUANTILE)) if here.size else np.inf
-        ranked.append((len(estimated) - len(here), p95, cell_size))
-    enough = [(lost, p95, cell) for lost, p95, cell in ranked if lost == 0 and p95 <= cap]
-    _, p95, cell_size = max(enough, key=lambda r: r[2]) if enough else min(ranked)
+        ranked[cell_size] = len(estimated) - len(here), p95
+    enough = [size for size, (lost, p95) in ranked.items() if lost == 0 and p95 <= cap]
+    return _Judged(len(estimate), ranked, enough)
+
+
+def _chosen(judged: _Judged, cells: pd.Series, sizes: dict[float, str]) -> dict[str, Any]:
+    """The cell size of a tile, which has so many cells at each."""
+    if judged.enough:
+        size = min(judged.enough, key=lambda size: cells[size])
+    elif judged.ranked:
+        size = min(judged.ranked, key=lambda size: judged.ranked[size])
+    else:
+        size = next(iter(sizes))
     return {
-        "places": len(estimate),
-        "cell_size": cell_size,
-        "p95": p95,
-        "suffices": bool(enough),
+        "places": judged.places,
+        "cell_size": size,
+        "p95": judged.ranked[size][1] if judged.ranked else None,
+        "suffices": bool(judged.enough) if judged.ranked else None,
+        "cells": cells[size],
     }
+
+
+def _costs(
+    rows: pd.DataFrame, sizes: dict[float, str], cells: pd.DataFrame, judged: Iterable[_Judged]
+) -> list[dict[str, Any]]:
+    """What each cell size costs: in cells, and in error against the baseline, the first."""
+    estimate = _by_choice(rows, "vd_mean")
+    baseline = estimate[next(iter(sizes.values()))]
+    suffices = Counter(size for one in judged for size in one.enough)
+    found = []
+    for size, choice in sizes.items():
+        change = (estimate[choice] - baseline).dropna().to_numpy(np.float64)
+        total = int(cells[size].sum())
+        found.append(
+            {
+                "cell_size": size,
+                "cells": total,
+                "map_bytes": total * CELL_BYTES,
+                "change": float(np.median(change)) if change.size else None,
+                "worse": float((change > 0.0).mean()) if change.size else None,
+                "suffices": suffices[size],
+            }
+        )
+    return found
 
 
 def _by_choice(rows: pd.DataFrame, column: str) -> pd.DataFrame:

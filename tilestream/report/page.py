@@ -15,7 +15,7 @@ from markupsafe import Markup
 from tilestream.notes import shared
 from tilestream.report import charts, evaluation, formatting
 from tilestream.report.colours import ACTUAL, CRITERION, HELD_OUT, OTHER
-from tilestream.report.comparison import QUANTILE, USUAL, Comparison
+from tilestream.report.comparison import QUANTILE, Comparison
 from tilestream.report.data import AROUND, Findings
 from tilestream.report.drives import EVALUATED
 from tilestream.report.pictures import ABOVE, BELOW, heights_ramp
@@ -142,7 +142,6 @@ def comparison_page(found: Comparison, content: Mapping[str, Any]) -> str:
         shown_every=charts.line_shows_every(found),
         apart=APART,
         quantile=QUANTILE,
-        usual=USUAL,
     )
 
 

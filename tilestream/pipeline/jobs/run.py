@@ -118,9 +118,14 @@ def _run(settings: RunSettings, client: Any | None, watch: Watch | None) -> None
             story = Story(settings, inputs, book)
             inputs = story.inputs
             book.facts["notes"] = dict(inputs.notes)
-            seen = {"shared": [settings.out, story.store.url], "inputs": story.files}
-            first = story.first()
-            execute(first, client, book.listening(watch), grow=story.grown, **seen)
+            execute(
+                story.first(),
+                client,
+                book.listening(watch),
+                grow=story.grown,
+                shared=[settings.out, story.store.url],
+                inputs=story.files,
+            )
             if story.large is not None:
                 estimate_large(story.large, client, book.listening(watch))
         learn(book.tasks, book.outcomes)
