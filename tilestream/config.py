@@ -12,7 +12,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from tilestream.errors import UsageError
+from tilestream.errors import SettingsError
 
 NESTED = re.compile(r" \w+Settings: ")
 """How settings inside others begin what is wrong with them: the key above says which they are."""
@@ -22,7 +22,7 @@ class Settings(BaseModel):
     """Base of all settings: frozen; an unknown key is an error at every level.
 
     Raises:
-        UsageError: a value that cannot be; names each key and what is wrong with it.
+        SettingsError: a value that cannot be; names each key and what is wrong with it.
     """
 
     model_config = ConfigDict(
@@ -33,21 +33,22 @@ class Settings(BaseModel):
         try:
             super().__init__(**values)
         except ValidationError as error:
-            raise UsageError(
-                f"{type(self).__name__}: "
-                + "; ".join(_readable(error, list(type(self).model_fields)))
-            ) from None
+            known = list(type(self).model_fields)
+            raise SettingsError(type(self).__name__, tuple(_readable(error, known))) from None
 
 
-def _readable(error: ValidationError, known: list[str]) -> Iterator[str]:
+def _readable(error: ValidationError, known: list[str]) -> Iterator[tuple[str, str]]:
+    """Each key that is wrong, and how the sentence about it goes on."""
     for problem in error.errors():
         key = ".".join(str(part) for part in problem["loc"])
         if problem["type"] == "extra_forbidden":
             near = difflib.get_close_matches(key, known, n=1)
             hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
-            yield f"{key} is no setting: {hint}"
+            yield key, f" is no setting: {hint}"
+        elif problem["type"] == "missing":
+            yield key, " is missing: give it"
         elif problem["type"] == "value_error":
             said = problem["msg"].removeprefix("Value error, ")
-            yield NESTED.sub(": ", f"{key} {said}").strip()
+            yield key, NESTED.sub(": ", f" {said}")
         else:
-            yield f"{key} is {reprlib.repr(problem['input'])}: {problem['msg']}"
+            yield key, f" is {reprlib.repr(problem['input'])}: {problem['msg']}"

@@ -16,6 +16,21 @@ class UsageError(TilestreamError, ValueError):
     """An argument or a setting that cannot be used as given."""
 
 
+class SettingsError(UsageError):
+    """Settings with values that cannot be; knows which, so that each can be named as it was given.
+
+    Args:
+        settings: what these settings are called.
+        problems: the keys, with dots between levels (empty: several together), and how the sentence
+            about each goes on, its separator included.
+    """
+
+    def __init__(self, settings: str, problems: tuple[tuple[str, str], ...]) -> None:
+        told = "; ".join(f"{key}{wrong}".strip() for key, wrong in problems)
+        super().__init__(f"{settings}: {told}")
+        self.problems = problems
+
+
 class SourceError(TilestreamError):
     """An input file or log that cannot be read as what it claims to be."""
 

@@ -2,8 +2,10 @@
 
 import functools
 import inspect
+import re
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -11,6 +13,7 @@ import typer
 from pydantic.fields import FieldInfo
 
 from tilestream.config import Settings
+from tilestream.errors import SettingsError, UsageError
 from tilestream.settings import LogOptions
 
 OLD_FLAGS = {"range_max": "max-range", "blind_rear_deg": "blind-rear", "sweep_s": "sweep"}
@@ -20,6 +23,8 @@ LOGS = "How logs are read"
 """Heading of the options that all commands have that read logs."""
 
 
+WORD = re.compile(r"\w+")
+"""What may be the name of a setting in a text."""
 CONTEXT, KEYWORD = "context", inspect.Parameter.POSITIONAL_OR_KEYWORD
 """The argument by which a command gets the line that it was called with."""
 
@@ -51,7 +56,7 @@ def with_settings(command: Callable[..., None]) -> Callable[..., None]:
     settings that those on the line make (`model_fields_set`).
 
     Raises:
-        UsageError: when the command runs, values that the settings refuse.
+        UsageError: when the command runs, values that the settings refuse; names the options.
     """
     hints = get_type_hints(command, include_extras=True)
     groups: dict[str, tuple[type[Settings], Fields]] = {}
@@ -76,13 +81,41 @@ def with_settings(command: Callable[..., None]) -> Callable[..., None]:
         for group, (model, chosen) in groups.items():
             of_line = {name: values.pop(name) for name in chosen.names}
             own = [name for name in of_line if name in chosen.own or was_given(context, name)]
-            values[group] = model(**{name: of_line[name] for name in own})
+            with _options_named(model, chosen.names):
+                values[group] = model(**{name: of_line[name] for name in own})
         command(**values)
 
     first = [p for p in parameters if p.default is inspect.Parameter.empty]
     rest = [p for p in parameters if p.default is not inspect.Parameter.empty]
     wrapped.__signature__ = inspect.Signature([*first, *rest])  # type: ignore[attr-defined]
     return wrapped
+
+
+@contextmanager
+def _options_named(model: type[Settings], names: Sequence[str]) -> Iterator[None]:
+    """What settings refuse is told with the options as they are typed."""
+    shown = {name: _shown(model, name) for name in names}
+    try:
+        yield
+    except SettingsError as error:
+        told = []
+        for key, wrong in error.problems:
+            if key:
+                field_, *levels = key.split(".")
+                told.append(".".join([shown.get(field_, field_), *levels]) + wrong)
+            else:  # of several together, which are named in the text
+                several = WORD.sub(lambda found: shown.get(found[0], found[0]), wrong)
+                told.append(f"this line{several}")
+        raise UsageError("; ".join(told)) from None
+
+
+def _shown(model: type[Settings], name: str) -> str:
+    """A field as it stands on a line: an option, or an argument as the help calls it."""
+    return name.upper() if model.model_fields[name].is_required() else _flag(name)
+
+
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
 
 
 def was_given(context: typer.Context, name: str) -> bool:
@@ -97,7 +130,8 @@ def _option(model: type[Settings], name: str, own: dict[str, Any]) -> inspect.Pa
     """
     known = model.model_fields[name]
     needed = known.is_required()
-    flags = [f"--{flag}" for flag in (name.replace("_", "-"), OLD_FLAGS.get(name)) if flag]
+    old = OLD_FLAGS.get(name)
+    flags = [_flag(name), *([f"--{old}"] if old else [])]
     panel = LOGS if name in LogOptions.model_fields else None
     how: Any = (
         typer.Argument(help=help_of(known))

@@ -1,11 +1,11 @@
 """The gate of a map release: what of a map exceeds a limit, or is not known."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator
 
 from tilestream.config import Settings
 from tilestream.model.figures import SEGMENT
@@ -36,11 +36,12 @@ class GateSettings(Settings):
     over: Over = "places"
     """Of what --fail-over asks: single places, or means over 12 m."""
 
-    @model_validator(mode="after")
-    def _positive(self) -> Self:
-        if self.fail_over is not None:
-            check_threshold(self.fail_over)
-        return self
+    @field_validator("fail_over")
+    @classmethod
+    def _positive(cls, limit: float | None) -> float | None:
+        if limit is not None and not (np.isfinite(limit) and limit > 0.0):
+            raise ValueError(f"is {limit!r}: give metres above 0")
+        return limit
 
 
 def gate(
