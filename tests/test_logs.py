@@ -336,7 +336,7 @@ def test_a_log_is_known_by_its_name(name: str, paths: dict[str, Path]) -> None:
 
 
 def test_what_is_no_log_says_what_is(tmp_path: Path) -> None:
-    known = str(LOG_FORMATS[0]).replace("(", r"\(").replace(")", r"\)")
+    known = LOG_FORMATS[0].short.replace("(", r"\(").replace(")", r"\)")
     with pytest.raises(SourceNotFoundError, match="no such file"):
         open_log(tmp_path / "none.mcap")
     (tmp_path / "a.rrd").write_bytes(b"RRF2")

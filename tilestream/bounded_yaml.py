@@ -3,6 +3,7 @@
 A few lines of aliases can stand for a million values, a word for a number of a million digits.
 """
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,8 @@ MAX_VALUES = 1_000_000
 """Most values, those that aliases repeat counted each time."""
 MAX_DEPTH = 32
 """Deepest nesting of lists and mappings."""
+TAB = re.compile(r"^ *\t", re.MULTILINE)
+"""What indents a line and may not."""
 MAX_DIGITS = 20
 """Longest whole number, its sign and prefix included: 64 bits fit."""
 
@@ -33,8 +36,13 @@ def read_yaml(path: Path, kind: type[TilestreamError]) -> Any:
             content = file.read(MAX_BYTES + 1)
     except FileNotFoundError as error:
         raise SourceNotFoundError(f"{path}: no such file") from error
-    with foreign_errors(kind, f"{path}: is no readable YAML", "mend it, or copy it again"):
-        return parse_yaml(content.decode("utf-8-sig"))
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise kind(f"{path}: is no text, and YAML is wanted: name another file") from None
+    tabs = "indent with spaces, not with tabs" if TAB.search(text) else ""
+    with foreign_errors(kind, f"{path}: is no readable YAML", tabs or "mend it, or copy it again"):
+        return parse_yaml(text)
 
 
 def parse_yaml(text: str) -> Any:

@@ -255,7 +255,7 @@ class Files:
         try:
             with self._reached():
                 entries = self.fs.ls(self.root, detail=False)
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             return []
         paths = {str(entry).rstrip("/") for entry in entries} - {self.root}
         return sorted(path.rsplit("/", 1)[-1] for path in paths)

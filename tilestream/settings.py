@@ -146,6 +146,14 @@ class LogSettings(LogOptions):
     until_s: Positive | None = None
     """Use the scans of a log before this time [s after its first]; not given: to the end."""
 
+    @model_validator(mode="after")
+    def _check_times(self) -> Self:
+        if self.until_s is not None and self.until_s <= self.from_s:
+            raise ValueError(
+                f"has from_s {self.from_s:g} and until_s {self.until_s:g}: give a later until_s"
+            )
+        return self
+
 
 class IngestSettings(Settings):
     """How a map is cut into tiles."""
@@ -154,7 +162,7 @@ class IngestSettings(Settings):
     """Edge of a tile [m], whole millimetres, a multiple of every cell size that will be used."""
     halo: float = 10.0
     """What tasks read around a tile [m]; 10 m is the reach of the terms of 2 m cells."""
-    map_leaf: float = 0.2
+    map_leaf: Annotated[float, Field(ge=0.0)] = 0.2
     """Edge of the voxels that the map is thinned to, one centroid each [m]; 0 keeps all points."""
     crs: str | None = None
     """CRS of the map, any string that pyproj reads; not given: that of the sources."""

@@ -1,5 +1,6 @@
 """What a map update changes: tiles, and sample points whose estimated error got worse."""
 
+import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -22,6 +23,8 @@ WORSE = 0.02
 """Estimates that grew by more than this count as worse [m]."""
 OTHERWISE = "its estimates were made with other settings, not only of another map"
 """What is noted of two runs."""
+
+NO_ESTIMATES = "it has no estimates: tiles are compared, and no sample points"
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,20 +78,24 @@ def diff(
 
     Raises:
         StoreNotFoundError: nothing there; or a run's map is gone, and not both have estimates.
-        UsageError: tiles of different size, which cannot be compared, or one run whose map was not
-            updated.
+        UsageError: tiles of different size, which cannot be compared, one run whose map was not
+            updated, or `worse` is no length.
         CrsError: maps in two CRS.
 
     Examples:
         >>> ts.diff("map.zarr", "map.zarr").same
         2
     """
+    if not (math.isfinite(worse) and worse >= 0.0):
+        raise UsageError(f"worse is {worse!r}: give metres, 0 or more")
     before = _was(old) if new is None else _is(old)
     after = _is(old if new is None else new)
     gone = {side.named: side.gone for side in (before, after) if side.gone}
     if gone and (before.places is None or after.places is None):
         raise StoreNotFoundError("; ".join(gone.values()))
-    told = {}
+    told: dict[str, list[str]] = {}
+    if (before.places is None) != (after.places is None):  # two maps are compared by their tiles
+        told = {side.named: [NO_ESTIMATES] for side in (before, after) if side.places is None}
     if before.settings and after.settings and before.settings != after.settings:
         told = {after.named: [OTHERWISE]}
     return MapDiff(

@@ -9,6 +9,8 @@ import logging
 import signal
 import sys
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from typing import Annotated, Any
 
@@ -16,7 +18,7 @@ import typer
 from rich.logging import RichHandler
 from typer.core import TyperGroup
 
-from tilestream.cli.printing import err, out, say, visible
+from tilestream.cli.printing import err, out, say
 from tilestream.errors import (
     PlanError,
     SourceNotFoundError,
@@ -92,19 +94,34 @@ COMMANDS = {
 class LateCommands(TyperGroup):
     """A group that imports a command's file when that command is to run, and no other."""
 
+    def make_context(self, *line: Any, **how: Any) -> Any:
+        """The options before the command."""
+        with _typers_errors():
+            return super().make_context(*line, **how)
+
     def invoke(self, ctx: Any) -> Any:
-        """Run the command of a line; an error that typer shows itself is made fit to be shown."""
-        try:
+        """Run the command of a line."""
+        with _typers_errors():
             return super().invoke(ctx)
-        except Exception as error:
-            if hasattr(error, "format_message"):  # it may name any file, as `info *` does
-                error.message = visible(error.message)  # type: ignore[attr-defined]
-            raise
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
         """The command of a line."""
         name, command, rest = super().resolve_command(ctx, args)
         return name, command and command_of(str(name)), rest
+
+
+@contextmanager
+def _typers_errors() -> Iterator[None]:
+    """What typer refuses of a line is told as all errors are, and not in a box of several lines."""
+    try:
+        yield
+    except Exception as error:
+        if not hasattr(error, "format_message") or type(error).__name__ == "NoArgsIsHelpError":
+            raise
+        context = getattr(error, "ctx", None)
+        command = "tilestream" if context is None else context.command_path
+        said = " ".join(error.format_message().split()).rstrip(".")
+        raise UsageError(f"{said}; `{command} --help` says what there is") from error
 
 
 def command_of(name: str) -> Any:

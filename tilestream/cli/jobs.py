@@ -22,7 +22,7 @@ from tilestream.pipeline.jobs import simulate as simulation
 from tilestream.pipeline.jobs.estimate import OUT, estimate_settings
 from tilestream.pipeline.jobs.forecast import forecast
 from tilestream.pipeline.jobs.run_book import RECORD, told_before
-from tilestream.pipeline.jobs.run_inputs import extent, simulations
+from tilestream.pipeline.jobs.run_inputs import check_files, extent, simulations
 from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
 from tilestream.pipeline.stages.simulated import SCENE_BYTES
 from tilestream.records import District
@@ -165,7 +165,10 @@ def do_and_tell(
 
 
 def do_job(settings: RunSettings, cluster: Cluster) -> Files:
-    """Run the main job with progress; the run directory."""
+    """Run the main job with progress; the run directory. Files that are not there are told before
+    workers are started.
+    """
+    check_files(settings)
     with cluster.client(settings.memory) as client, progress() as watch:
         return Files.at(main_job.run(settings, client, watch))
 

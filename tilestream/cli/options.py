@@ -1,5 +1,6 @@
 """Options that several commands have, and what their words mean."""
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Annotated
@@ -33,10 +34,13 @@ def numbers(lists: list[str], option: str) -> list[float]:
     """
     parts = [part.strip() for text in lists for part in text.split(",")]
     try:
-        return [float(part) for part in parts]
+        found = [float(part) for part in parts]
     except ValueError:
+        found = [math.nan]
+    if not all(map(math.isfinite, found)):
         told = ", ".join(lists)
-        raise UsageError(f"{option} {told}: give numbers, with commas between them") from None
+        raise UsageError(f"{option} {told}: give numbers, with commas between them")
+    return found
 
 
 @contextmanager
@@ -62,7 +66,8 @@ def routes_of(
     }
     read = read_each(((path, how) for path in files), read_all_routes).at_least(spacing)
     known = () if store.manifest is None else store.manifest.identities
-    far = {"routes": off_map(known, store.grid, read.routes)}
+    near = [route for route in read.routes if not off_map(known, store.grid, [route])]
+    far = {"routes": off_map(known, store.grid, read.routes) if near else []}  # none is refused
     notes = noticed(map_notes(store), read.notes_of(files), far)
     say_notes(notes)
     try:

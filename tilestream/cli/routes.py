@@ -261,7 +261,10 @@ def compare(
         list[str], typer.Option(help=f"{', '.join(SENSORS)}, or a YAML file; several times.")
     ] = ["VLP16"],  # noqa: B006 - as below: typer's way to name a default
     cell_size: Annotated[
-        list[str], typer.Option(help="Edges of the NDT cells [m], e.g. 1.0,2.0.")
+        list[str],
+        typer.Option(
+            help="Edges of the NDT cells [m], e.g. 2.0,1.0; the others are compared with the first."
+        ),
     ] = ["2.0"],  # noqa: B006
     ranges: Ranges = [],  # noqa: B006
     blind_rear: BlindRears = ["0"],  # noqa: B006
@@ -274,8 +277,7 @@ def compare(
     cluster: Cluster = HERE,
 ) -> None:
     """Compare lidars, ranges, resolutions of map and scan along routes, from the map alone."""
-    for limit in (report.threshold, cap):
-        check_threshold(limit)
+    check_threshold(cap, "--cap")
     opened = open_store(store)
     with routes_of(route, places.project_to, places.spacing, opened, log) as (read, notes):
         routes = read.routes

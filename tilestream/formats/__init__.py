@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tilestream.errors import SourceNotFoundError, UsageError
+from tilestream.errors import SourceError, SourceNotFoundError, UsageError
 from tilestream.files import local_path
 from tilestream.formats.base import Block, PointSource, SourceInfo, Span, corner_of
 from tilestream.formats.drive import DRIVES
@@ -27,6 +27,7 @@ __all__ = [
     "files_of",
     "matches_of",
     "open_source",
+    "require_format",
 ]
 
 _READ_MAX = 1_000_000_000
@@ -138,6 +139,25 @@ def matches_of(pattern: str | os.PathLike[str]) -> list[str]:
     if not matches:
         raise SourceNotFoundError(f"{name}: the pattern matches no file; check the path")
     return matches
+
+
+def require_format(sources: Iterable[str]) -> None:
+    """Refuse sources of which none is of a format that is read, by their first bytes.
+
+    Raises:
+        SourceNotFoundError: one names nothing.
+        SourceError, OSError: why the first cannot be read.
+    """
+    errors: list[Exception] = []
+    for path in [match for source in sources for match in matches_of(source)]:
+        try:
+            format_of(path, FORMATS)
+        except (SourceError, OSError) as error:
+            errors.append(error)
+        else:
+            return
+    if errors:
+        raise errors[0]
 
 
 def _is_meant(path: str) -> bool:

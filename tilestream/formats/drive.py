@@ -104,8 +104,13 @@ def open_drive(
         raise UsageError(f"range_max = {range_max}: must be a positive length in metres")
     log = open_log(path, LogOptions(**options))
     scans = scans or ScanSelection()
-    if not log.posed[scans.indices(log.stamps_ns)].any():
-        raise PoseError(f"{path}: none of its {len(log)} scans that {scans} selects has a pose")
+    selected = scans.indices(log.stamps_ns)
+    if not log.posed[selected].any():
+        lasts = (log.stamps_ns[-1] - log.stamps_ns[0]) / 1e9 if len(log) else 0.0
+        raise PoseError(
+            f"{path}: {len(selected)} of its {len(log)} scans, which last {lasts:.1f} s, are "
+            f"selected ({scans}), and none of these has a pose: select others"
+        )
     return DriveSource(log, scans, range_max)
 
 

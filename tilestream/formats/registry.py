@@ -58,9 +58,14 @@ class Format(Generic[Opened_co]):
                 f"{path}: claims more than fits into memory ({error}): it is damaged, or too large"
             ) from error
 
-    def __str__(self) -> str:
+    @property
+    def short(self) -> str:
+        """Its name, and what a file or a directory of it is known by."""
         where = ", ".join(self.endings) or f"a directory with {self.marker}"
-        return f"{self.name} ({where}): {self.what}"
+        return f"{self.name} ({where})"
+
+    def __str__(self) -> str:
+        return f"{self.short}: {self.what}"
 
 
 def format_of(path: str, formats: Sequence[Format[Opened_co]]) -> Format[Opened_co]:
@@ -79,7 +84,7 @@ def format_of(path: str, formats: Sequence[Format[Opened_co]]) -> Format[Opened_
             ending = next(f.endings[0] for f in formats if f.endings)
             raise UnknownFormatError(
                 f"{path}: a directory of no supported format; give its files, e.g. "
-                f"'{path}/*{ending}'; supported are {'; '.join(map(str, formats))}"
+                f"'{path}/*{ending}'; supported are {_known(formats)}"
             )
         return found
     if not Path(path).is_file():
@@ -119,7 +124,11 @@ def _unknown_ending(
     what = f"the ending {ending!r} is of no supported format" if ending else "it has no ending"
     if content is not None:
         return f"{what}; its content looks like {content.name}, rename it to {content.endings[0]}"
-    return f"{what}; supported are {'; '.join(map(str, formats))}"
+    return f"{what}; supported are {_known(formats)}"
+
+
+def _known(formats: Sequence[Format[Opened_co]]) -> str:
+    return ", ".join(one.short for one in formats)
 
 
 def _another_content(

@@ -20,14 +20,18 @@ BRIDGE = 5.0
 """Places over the threshold this near along a route are one segment, whatever lies between [m]."""
 
 
-def check_threshold(limit: float) -> None:
+def check_threshold(limit: float, name: str = "threshold") -> None:
     """Refuse a threshold that is no positive length.
+
+    Args:
+        limit: the threshold [m].
+        name: what it was called where it was given.
 
     Raises:
         UsageError: it is not.
     """
     if not (np.isfinite(limit) and limit > 0.0):
-        raise UsageError(f"threshold {limit!r}: give metres above 0")
+        raise UsageError(f"{name} {limit!r}: give metres above 0")
 
 
 def joined(places: pd.DataFrame) -> NDArray[np.bool_]:

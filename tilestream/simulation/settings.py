@@ -186,6 +186,8 @@ def load_preset(name: str) -> SimulationSettings:
         raise SourceNotFoundError(f"{name}: no preset and no file; presets are paper and physical")
     with resources.as_file(shipped) if shipped.is_file() else nullcontext(own) as path:
         values = read_yaml(path, UsageError) or {}
+    if not isinstance(values, dict):
+        raise UsageError(f"{name}: give settings of a simulation, e.g. preset: mine")
     try:
         return SimulationSettings(**values)
     except (TypeError, UsageError) as error:

@@ -49,6 +49,7 @@ from tilestream.store.manifest import Manifest as Manifest
 from tilestream.store.manifest import read_manifest
 from tilestream.store.record import Record, State, read_record, source_of, way_of, write_record
 from tilestream.store.record import StoreSettings as StoreSettings
+from tilestream.store.record import require_folder as require_folder
 from tilestream.store.shares import PREFIX as SHARES
 from tilestream.store.shares import Share as Share
 from tilestream.store.shares import Shares as Shares

@@ -82,6 +82,20 @@ def write_record(files: Files, record: Record) -> None:
     write_group(files, {"schema": SCHEMA, "lattice_origin": [0.0, 0.0, 0.0], **asdict(record)})
 
 
+def require_folder(url: str | os.PathLike[str]) -> None:
+    """Refuse a place where no folder of results can be, before any work is done for them.
+
+    Raises:
+        UsageError: it is a file or below one, or a tile store.
+    """
+    place = Files.at(url)
+    path = Path(place.root)
+    if place.local and any(way.is_file() for way in (path, *path.parents)):
+        raise UsageError(f"{os.fspath(url)} is a file, or below one: name another folder")
+    if place.under(NODE).there():
+        raise UsageError(f"{os.fspath(url)} is a tile store: name another folder for the results")
+
+
 def read_record(url: str) -> Record:
     """The record of a store.
 
@@ -102,7 +116,8 @@ def read_record(url: str) -> Record:
         ) from None
     except NotADirectoryError:
         raise UsageError(
-            f"{url} is a file, or below one, and a tile store is a folder: name another path"
+            f"{url} is a file, or below one, and a tile store is a folder, which `tilestream "
+            "ingest SOURCES --store FOLDER` makes: name another path"
         ) from None
     except (KeyError, ValueError, TypeError) as error:
         raise StoreError(f"{root.root} is damaged, or of no tile store: {error}") from error

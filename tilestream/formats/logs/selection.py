@@ -39,6 +39,21 @@ class ScanSelection:
                 "start must be at least 0 and stop not before it"
             )
 
+        if self.until_s is not None and self.until_s <= self.from_s:
+            raise UsageError(
+                f"scan selection: from_s = {self.from_s:g}, until_s = {self.until_s:g}; "
+                "until_s must be later than from_s"
+            )
+
+    def __str__(self) -> str:
+        parts = [
+            f"scans {self.start} to {self.stop}" * (self.start > 0 or self.stop is not None),
+            f"every {self.every} from {self.offset} on" * (self.every > 1),
+            f"from {self.from_s:g} s on" * (self.from_s > 0.0),
+            f"until {self.until_s} s" * (self.until_s is not None),
+        ]
+        return ", ".join(part for part in parts if part) or "all scans"
+
     def indices(self, stamps_ns: Int64) -> Int64:
         """Indices of the scans to use, rising, among scans with these (k,) rising stamps [ns]."""
         index = np.arange(len(stamps_ns))

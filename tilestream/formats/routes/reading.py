@@ -232,7 +232,7 @@ def _drawn(path: str, options: LogOptions) -> Sequence[Path3 | Lost]:
     if not Path(path).is_file():
         raise SourceNotFoundError(f"{path}: no such file; check the path")
     if ending not in READERS:
-        known = ", ".join([*READERS, *map(str, LOG_FORMATS)])
+        known = ", ".join([*READERS, *(one.short for one in LOG_FORMATS)])
         raise UnknownFormatError(f"{path}: the ending {ending!r} is of no route; known are {known}")
     drawn = READERS[ending](path)
     if not drawn:

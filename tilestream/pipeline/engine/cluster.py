@@ -2,6 +2,7 @@
 
 import logging
 import os
+import re
 import signal
 import socket
 import ssl
@@ -25,6 +26,8 @@ from tilestream.pipeline.engine.seen import require_blocking
 logger = logging.getLogger(__name__)
 
 LOOPBACK = "127.0.0.1"
+PROTOCOLS = ("tcp", "tls", "ws", "wss", "ucx")
+"""What Dask's addresses may begin with."""
 ORIGINS = "distributed.scheduler.dashboard.bokeh-application.allow_websocket_origin"
 """Dask's setting of whose pages may open a WebSocket to a dashboard."""
 ONE_THREAD = {
@@ -102,6 +105,7 @@ def dask_client(
     security = None if tls is None else tls.security()
     count = CPU_COUNT if workers is None else workers
     if scheduler is not None:
+        _require_address(scheduler, security)
         how = "" if scheduler.startswith("tls:") else ", not encrypted"
         logger.info("connecting to %s%s", scheduler, how)
         with silence_logging_cmgr(logging.CRITICAL), _connected(scheduler, security) as client:
@@ -197,12 +201,26 @@ class _Client(distributed.Client):
             raise
 
 
+def _require_address(scheduler: str, security: Any | None) -> None:
+    """Refuse what is no address of a scheduler, before one waits for it to answer.
+
+    Raises:
+        UsageError: another protocol, no port, or certificates are missing.
+    """
+    protocol, _, rest = scheduler.rpartition("://")
+    if (protocol or "tcp") not in PROTOCOLS or not re.search(r".:\d+/?$", rest):
+        raise UsageError(
+            f"{scheduler!r} is no scheduler's address: give one like tcp://10.0.0.1:8786"
+        )
+    known = security is not None or dask.config.get("distributed.comm.tls.ca-file")
+    if protocol == "tls" and not known:
+        raise UsageError(f"{scheduler} wants certificates: give --tls-ca, --tls-cert and --tls-key")
+
+
 @contextmanager
 def _connected(scheduler: str, security: Any | None) -> Iterator[Any]:
     """A client of a scheduler that runs elsewhere."""
     encrypted = scheduler.startswith("tls:")
-    if encrypted and security is None and not dask.config.get("distributed.comm.tls.ca-file"):
-        raise UsageError(f"{scheduler} wants certificates: give --tls-ca, --tls-cert and --tls-key")
     try:
         client = _Client(scheduler, security=security)  # type: ignore[no-untyped-call]
     except (OSError, TimeoutError, CommClosedError) as error:

@@ -15,6 +15,7 @@ from tilestream.pipeline.jobs.map_expected import tiles_to_read
 from tilestream.pipeline.jobs.run_before import update_of
 from tilestream.pipeline.jobs.run_inputs import (
     Inputs,
+    check_files,
     check_model,
     extent,
     ingest_settings,
@@ -60,6 +61,7 @@ def forecast(settings: RunSettings) -> Forecast:
         PlanError: a task does not fit `memory`.
         UsageError, SourceError, StoreError, ModelError: as the job itself.
     """
+    check_files(settings)
     check_model(settings)
     if settings.simulate is not None and not is_simulated(settings):
         return _simulation_first(settings, settings.simulate)

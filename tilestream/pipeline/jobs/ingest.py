@@ -71,6 +71,7 @@ def ingest(
         LockedError: another process writes to the store.
         CrsError: two sources in different CRS, or a source that is not in `crs`.
         PlanError: the job does not fit `memory`.
+        SourceError: no source can be opened, and there is no map yet.
         PartialError: some sources or tiles failed; the message lists them with reasons, and
             the rest is done and can be opened.
 
@@ -112,7 +113,10 @@ def read_sources(
     """What `ingest` begins with; arguments and errors as there."""
     found = within(examine_all(sources, settings, log_options, scans), memory)
     wanted = store_settings(with_crs(settings, found))
-    store = _there(str(url), wanted, found) or TileStore.create(url, wanted)
+    store = _there(str(url), wanted, found)
+    if store is None:
+        require_some(found)
+        store = TileStore.create(url, wanted)
     recorded = _recorded(store, found)
     reading = _reading(store, found, memory)
     if reading.current and recorded != store.sources():
@@ -147,8 +151,7 @@ def plan_ingest(
     error is the first one's.
     """
     found = examine_all(sources, settings, log_options, scans)
-    if all(source.reason for source in found):
-        raise SourceError(found[0].reason)
+    require_some(found)
     wanted = store_settings(with_crs(settings, found))
     there = _there(str(url), wanted, found)
     if there is None:
@@ -182,6 +185,17 @@ def _there(url: str, wanted: StoreSettings, found: Sequence[Source]) -> TileStor
             "away what is no part of it any more, or give another path for the new store"
         )
     return store
+
+
+def require_some(found: Sequence[Source]) -> None:
+    """Refuse sources of which none can be opened, before anything is made of them.
+
+    Raises:
+        SourceError: says why the first cannot.
+    """
+    if all(source.reason for source in found):
+        several = f"none of {len(found)} sources can be read: " * (len(found) > 1)
+        raise SourceError(several + found[0].reason)
 
 
 def _recorded(store: TileStore, found: Sequence[Source]) -> list[dict[str, Any]]:

@@ -20,6 +20,7 @@ from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.engine.stage import Task
 from tilestream.pipeline.stages.drive_scans import DriveScans, Sample
 from tilestream.pipeline.stages.map_part import MapPart
+from tilestream.store import require_folder
 from tilestream.tables import read_mark
 
 INVENTORY = "inventory.json"
@@ -101,9 +102,11 @@ def make_tables(
     """Run a plan that writes tables below a folder, alone there; the reasons of what failed.
 
     Raises:
-        UsageError, DamagedError: as `announce`.
+        UsageError: the folder is a tile store, and as `announce`.
+        DamagedError: as `announce`.
         LockedError: another process writes to the folder.
     """
+    require_folder(out)
     with only_writer(out):
         announce(plan.tasks)
         stores = [t.writes.store_url for t in plan.tasks if isinstance(t.writes, TileArrays)]

@@ -4,12 +4,13 @@ import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain, groupby
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from tilestream.errors import PartialError, TileNotReadyError, UsageError
+from tilestream.errors import PartialError, SourceNotFoundError, TileNotReadyError, UsageError
 from tilestream.factors.rows import Samples, samples_of_drive
 from tilestream.files import local_path, place_of
 from tilestream.formats.logs import ScanLog, ScanSelection
@@ -93,6 +94,7 @@ def localize(
     Raises:
         UsageError: settings that cannot be, a spacing that is not positive, no scan selected, or
             one that the map was made of (`allow_overlap`).
+        SourceNotFoundError: there is no such log.
         SourceError: the log cannot be read, has no clouds or no poses.
         TileNotReadyError: no tile of the map within reach of the drive.
         IncompleteError: the map is not whole, and not `partial`.
@@ -101,6 +103,8 @@ def localize(
         PartialError: some tasks failed; the message lists them, the rest is done.
     """
     how = replace(reading, path=os.fspath(log)) if reading else Reading(os.fspath(log))
+    if not Path(local_path(log)).exists():
+        raise SourceNotFoundError(f"{os.fspath(log)}: no such log; check the path")
     scans = scans or ScanSelection()
     if not allow_overlap:
         drive_overlap(how, scans, spacing, store.sources(), scans_per_point).require_none()

@@ -43,6 +43,7 @@ from tilestream.pipeline.jobs.run_findings import Done, findings_of, heights_tol
 from tilestream.pipeline.jobs.run_inputs import (
     JOB,
     Inputs,
+    check_files,
     check_model,
     inputs_of,
     seen_otherwise,
@@ -95,9 +96,11 @@ def run(
             message lists them, the rest is done and reported.
     """
     settings = config if isinstance(config, RunSettings) else read_settings(config)
+    check_files(settings)
     check_model(settings)
+    inputs = None if settings.simulate is not None else inputs_of(settings, client, watch)
     with only_writer(settings.out), _map_alone(settings):
-        _run(settings, client, watch)
+        _run(settings, inputs, client, watch)
     return Path(settings.out) if settings.folder.local else settings.out
 
 
@@ -107,13 +110,17 @@ def _map_alone(settings: RunSettings) -> AbstractContextManager[None]:
     return only_writer(settings.store_url) if makes else nullcontext()
 
 
-def _run(settings: RunSettings, client: Any | None, watch: Watch | None) -> None:
-    """The whole job, of the one process that may write the run directory."""
+def _run(
+    settings: RunSettings, inputs: Inputs | None, client: Any | None, watch: Watch | None
+) -> None:
+    """The whole job, of the one process that may write the run directory; a city is simulated
+    first.
+    """
     book = _begin(settings)
     with book.closed():
         book.write("running")  # in here: who reads it may stop the job at once
         with report_kept(client, settings.folder.under("dask-performance.html").address):
-            inputs = inputs_of(settings, client, watch)
+            inputs = inputs or inputs_of(settings, client, watch)
             book.failures |= inputs.failures
             story = Story(settings, inputs, book)
             inputs = story.inputs

@@ -8,6 +8,7 @@ from typing import Any
 from tilestream.errors import ModelError, SourceNotFoundError, UsageError
 from tilestream.factors.own import OWN, own_factors
 from tilestream.files import Files
+from tilestream.formats import require_format
 from tilestream.formats.logs import ScanSelection, is_log
 from tilestream.formats.routes import RoutesRead
 from tilestream.model.dataset import made_with
@@ -37,9 +38,12 @@ from tilestream.settings import (
     VirtualSettings,
 )
 from tilestream.simulation.settings import SimulationSettings, load_preset, settings_in
-from tilestream.store import open_store
+from tilestream.store import open_store, require_folder
 
-LEADS_ON = f"; without a model the virtual drive makes the estimates: model {UNTRAINED}"
+LEADS_ON = (
+    f"; without a model the virtual drive makes the estimates: --model {UNTRAINED}, or model: "
+    f"{{recipe: {UNTRAINED}}}"
+)
 """What there is besides a model that does not fit."""
 JOB = "job"
 """What notes are filed under that are about the job as a whole."""
@@ -309,12 +313,34 @@ def check_model(settings: RunSettings) -> None:
         return
     file = file_of(settings.model.use)
     if not Files.at(file).there():
-        raise SourceNotFoundError(f"{file}: no such model file; see model.use")
+        raise SourceNotFoundError(f"{file}: no such model file; see model.use (--model){LEADS_ON}")
     try:
         check_making(load_model(file), making_of(settings))
     except ModelError as error:
         told = str(error).removeprefix(f"{file}: ")
         raise ModelError(f"{settings.model.use}: {told}{LEADS_ON}") from None
+
+
+def check_files(settings: RunSettings) -> None:
+    """Refuse a job of real files that are not there, before anything is made.
+
+    Raises:
+        SourceNotFoundError: no source of the map, no log, or no file of routes of that name.
+        SourceError, OSError: no source of the map is of a format that is read.
+        StoreError: the map is to be there and cannot be opened.
+        UsageError: the run directory is a tile store.
+    """
+    require_folder(settings.out)
+    if settings.simulate is not None:
+        return
+    require_format(settings.map.sources)
+    if not settings.map.sources:
+        open_store(settings.store_url)
+    for drive in settings.drives:
+        reading_of(drive)
+    for route in settings.routes:
+        if not Path(route).exists():
+            raise SourceNotFoundError(f"{route}: no such file; check the path")
 
 
 def reading_of(drive: DriveSettings) -> DriveReading:
@@ -324,7 +350,7 @@ def reading_of(drive: DriveSettings) -> DriveReading:
         SourceNotFoundError: there is no such log.
     """
     if not Path(drive.log).exists():
-        raise SourceNotFoundError(f"{drive.log}: no such log")
+        raise SourceNotFoundError(f"{drive.log}: no such log; check the path")
     return DriveReading(
         drive.log,
         drive.log_options,

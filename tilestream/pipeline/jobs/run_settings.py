@@ -29,6 +29,9 @@ from tilestream.settings import (
     VirtualSettings,
 )
 
+BEGIN = "`tilestream template` prints one, and `tilestream estimate MAP` needs none"
+"""What to do without a job."""
+
 
 def _known(recipe: str) -> str:
     if recipe not in REGRESSORS:
@@ -169,6 +172,12 @@ class RunSettings(PlaceSettings):
             raise ValueError(
                 f"has model.recipe {recipe}, which needs observe: give observe, or one of {others}"
             )
+        reach = None if self.observe is None else self.observe.range_max
+        if reach is not None and reach > self.vehicle.range_max:
+            raise ValueError(
+                f"has observe.range_max (--range-max) {reach:g} m, and {self.vehicle.name} sees "
+                f"{self.vehicle.range_max:g} m: give no more than that"
+            )
         if recipe == UNTRAINED and use:
             raise ValueError(f"has model.recipe {UNTRAINED} and model.use: give one of them")
         return self
@@ -213,11 +222,13 @@ def read_settings(path: str | os.PathLike[str], changes: Sequence[str] = ()) -> 
             cannot be.
     """
     place = Path(local_path(path))
+    if place.is_dir():
+        raise UsageError(f"{place}: a directory, and a job is a YAML file; {BEGIN}")
     if not place.is_file():
-        raise SourceNotFoundError(f"{place}: no such config; `tilestream template` prints one")
+        raise SourceNotFoundError(f"{place}: no such config; {BEGIN}")
     values = read_yaml(place, UsageError)
     if not isinstance(values, dict):
-        raise UsageError(f"{place}: give the fields of a job, e.g. out: run")
+        raise UsageError(f"{place}: give the fields of a job, e.g. out: run; {BEGIN}")
     for change in changes:
         _apply(values, change)
     try:

@@ -32,6 +32,7 @@ from tilestream.pipeline.stages.simulated import (
 from tilestream.simulation.city import data_file, stretches
 from tilestream.simulation.settings import SimulationSettings
 from tilestream.simulation.streets import Street, check_clear, read_streets, street_called
+from tilestream.store import require_folder
 
 STRETCH = 50
 """Sample points of a stretch: a task's worth."""
@@ -83,6 +84,7 @@ def simulate(
         PartialError: some tasks failed; the message lists them, the rest is there.
     """
     folder = Path(place_of(local_path(out)))
+    require_folder(folder)
     plan = plan_simulation(
         settings,
         folder,
