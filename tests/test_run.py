@@ -342,11 +342,11 @@ def test_a_worker_that_is_busy_is_waited_for_and_that_is_said(
             return {"tcp://10.0.0.2:1234": []}
 
     client = Client()
-    _Workers(client, patience=60.0).wait_for_orphans()
+    _Workers(client, patience=60.0, meet=lambda _: None).wait_for_orphans()
     assert client.asked == 3
     assert caplog.text.count("busy and does not answer yet") == 1
     with pytest.raises(TaskError, match="has not answered for 0 s"):
-        _Workers(Client(), patience=0.0).wait_for_orphans()
+        _Workers(Client(), patience=0.0, meet=lambda _: None).wait_for_orphans()
 
 
 def test_workers_of_our_own_live_through_an_interrupt(workers: distributed.Client) -> None:

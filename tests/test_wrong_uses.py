@@ -44,7 +44,7 @@ USES: list[tuple[str, int, str]] = [
     ("ingest street.pcd --store other.zarr", 1, "other.zarr, schema, install the newer"),
     ("ingest street.pcd --store s3:/bucket/map.zarr", 2, "s3:/bucket/map.zarr, s3://"),
     ("ingest street.pcd --store gopher://a/b", 2, "gopher"),
-    (f"ingest street.pcd --store {LONG}.zarr", 1, "name too long, aaa.zarr"),
+    (f"ingest street.pcd --store {LONG}.zarr", 1, "File name too long, aaa.zarr, shorter"),
     # numbers and words
     (f"{INGEST} --tile-size -20", 2, "tile_size, -20, more than 0"),
     (f"{INGEST} --tile-size nan", 2, "--tile-size, nan"),
@@ -82,7 +82,7 @@ USES: list[tuple[str, int, str]] = [
     (f"{OF_LOG} --points-topic /a,/b --lidar-frame c", 2, "/a,/b, --lidar-frame, leave them out"),
     # what is there
     ("status gone.zarr", 2, "gone.zarr, tilestream ingest"),
-    ("status run", 2, "run, no tile store"),
+    ("status run", 2, "run, no tile store, tilestream info"),
     ("status street.pcd", 2, "street.pcd, is a file, tilestream ingest"),
     ("status other.zarr", 1, "other.zarr, schema"),
     ("status map.zarr route.csv", 2, "route.csv, status --help"),
@@ -108,7 +108,7 @@ USES: list[tuple[str, int, str]] = [
     ("estimate empty --route route.csv", 1, "empty, its files"),
     (f"{ESTIMATE} --out route.csv", 2, "route.csv, another folder"),
     (f"{ESTIMATE} --out map.zarr", 2, "map.zarr, is a tile store, another folder"),
-    (f"{ESTIMATE} --out=", 2, "out, a path is empty"),
+    (f"{ESTIMATE} --out=", 2, "out a path is empty, name a"),
     (f"{ESTIMATE} --model gone.skops", 2, "gone.skops, --model physics"),
     (f"{ESTIMATE} --model street.pcd", 1, "street.pcd, no model file"),
     (f"{ESTIMATE} --matcher fast", 2, "--matcher fast, autoware"),
@@ -245,6 +245,7 @@ def test_a_folder_that_one_may_not_write_to(
         (world / "empty").chmod(0o700)
     (answer,) = capsys.readouterr().err.splitlines()
     assert "Permission denied" in answer
+    assert "another place" in answer
     assert "empty/map.zarr" in answer
 
 

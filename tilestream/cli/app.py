@@ -32,7 +32,13 @@ INTERRUPTED = 130
 """Exit code of a command that was stopped with Ctrl-C."""
 TERMINATED = 143
 """Exit code of a command that was stopped with SIGTERM, as a shell would give it."""
-MAKE_ROOM = ": make room; the same command continues where it was"
+OF_DISKS = {
+    errno.ENOSPC: "make room; the same command continues where it was",
+    errno.EACCES: "name another place, or ask whoever owns it for the right",
+    errno.EROFS: "name another place: nothing can be written there",
+    errno.ENAMETOOLONG: "give a shorter name",
+}
+"""What to do about an error of a disk."""
 MARKUP: Any = "markdown"  # the other mode takes [m] for a style
 COMMANDS = {
     "estimate": (
@@ -121,6 +127,7 @@ def _typers_errors() -> Iterator[None]:
         context = getattr(error, "ctx", None)
         command = "tilestream" if context is None else context.command_path
         said = " ".join(error.format_message().split()).rstrip(".")
+        said = said.replace("Value error, ", "")  # pydantic's
         raise UsageError(f"{said}; `{command} --help` says what there is") from error
 
 
@@ -232,6 +239,6 @@ def _was_terminated(error: BaseException | None) -> bool:
 def _report(error: Exception, debug: bool, code: int) -> int:
     if debug:
         err.print_exception()
-    full = isinstance(error, OSError) and error.errno == errno.ENOSPC
-    say(f"error: {error}{MAKE_ROOM if full else ''}", to=err)
+    advice = OF_DISKS.get(error.errno or 0) if isinstance(error, OSError) else None
+    say(f"error: {error}{f': {advice}' if advice else ''}", to=err)
     return code

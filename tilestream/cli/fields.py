@@ -81,7 +81,7 @@ def with_settings(command: Callable[..., None]) -> Callable[..., None]:
         for group, (model, chosen) in groups.items():
             of_line = {name: values.pop(name) for name in chosen.names}
             own = [name for name in of_line if name in chosen.own or was_given(context, name)]
-            with _options_named(model, chosen.names):
+            with options_named(model, chosen.names):
                 values[group] = model(**{name: of_line[name] for name in own})
         command(**values)
 
@@ -92,8 +92,8 @@ def with_settings(command: Callable[..., None]) -> Callable[..., None]:
 
 
 @contextmanager
-def _options_named(model: type[Settings], names: Sequence[str]) -> Iterator[None]:
-    """What settings refuse is told with the options as they are typed."""
+def options_named(model: type[Settings], names: Sequence[str]) -> Iterator[None]:
+    """What settings refuse is told with the options as they are typed, of these of their fields."""
     shown = {name: _shown(model, name) for name in names}
     try:
         yield

@@ -10,7 +10,7 @@ import typer
 from tilestream.apps import diff as map_diff
 from tilestream.apps import verbs
 from tilestream.cli.cluster import ALL_CORES, HERE, AllCores, Cluster, on_cluster
-from tilestream.cli.fields import fields, with_settings
+from tilestream.cli.fields import fields, options_named, with_settings
 from tilestream.cli.options import AsJson, Changes, Config, DryRun
 from tilestream.cli.printing import err, out, print_json, say, say_notes
 from tilestream.cli.progress import progress
@@ -106,9 +106,10 @@ def estimate(
     It ends by printing what the estimates are worth, the headline, and where the report is. The
     same command continues a job that was stopped. `tilestream run` learns from drives too.
     """
-    settings = estimate_settings(
-        sources, route, folder, model, places, seeing, labels, which_map, report
-    )
+    with options_named(RunSettings, ()):
+        settings = estimate_settings(
+            sources, route, folder, model, places, seeing, labels, which_map, report
+        )
     if dry_run:
         show_plan(settings, as_json)
     else:

@@ -111,8 +111,11 @@ def read_record(url: str) -> Record:
         text = root.read()
         schema = int(said_by(text)["schema"])
     except FileNotFoundError:
+        store = "FOLDER" if root.parent.there() else url
+        other = f"; `tilestream info {url}` says what is there" * (store != url)
         raise StoreNotFoundError(
-            f"no tile store at {url}: make one with `tilestream ingest SOURCES --store {url}`"
+            f"no tile store at {url}: make one with `tilestream ingest SOURCES --store {store}`"
+            f"{other}"
         ) from None
     except NotADirectoryError:
         raise UsageError(
