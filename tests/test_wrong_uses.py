@@ -108,7 +108,7 @@ USES: list[tuple[str, int, str]] = [
     ("estimate empty --route route.csv", 1, "empty, its files"),
     (f"{ESTIMATE} --out route.csv", 2, "route.csv, another folder"),
     (f"{ESTIMATE} --out map.zarr", 2, "map.zarr, is a tile store, another folder"),
-    (f"{ESTIMATE} --out=", 2, "out a path is empty, name a"),
+    (f"{ESTIMATE} --out=", 2, "--out a path is empty, name a"),
     (f"{ESTIMATE} --model gone.skops", 2, "gone.skops, --model physics"),
     (f"{ESTIMATE} --model street.pcd", 1, "street.pcd, no model file"),
     (f"{ESTIMATE} --matcher fast", 2, "--matcher fast, autoware"),
@@ -143,6 +143,7 @@ USES: list[tuple[str, int, str]] = [
     (f"{COMPARE} --cell-size two", 2, "--cell-size, two, numbers"),
     (f"{COMPARE} --range-max 500", 2, "VLP16 sees 100 m, 500"),
     (f"{COMPARE} --range-max nan", 2, "--range-max, nan"),
+    (f"{COMPARE} --scan-leaf -1", 2, "--scan-leaf, -1"),
     (f"{COMPARE} --cap 0", 2, "--cap, 0.0"),
     (f"{COMPARE} --threshold nan", 2, "--threshold, nan"),
     # cities

@@ -4,7 +4,7 @@ import functools
 import inspect
 import re
 import types
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -81,7 +81,7 @@ def with_settings(command: Callable[..., None]) -> Callable[..., None]:
         for group, (model, chosen) in groups.items():
             of_line = {name: values.pop(name) for name in chosen.names}
             own = [name for name in of_line if name in chosen.own or was_given(context, name)]
-            with options_named(model, chosen.names):
+            with options_named({name: _shown(model, name) for name in chosen.names}):
                 values[group] = model(**{name: of_line[name] for name in own})
         command(**values)
 
@@ -92,9 +92,10 @@ def with_settings(command: Callable[..., None]) -> Callable[..., None]:
 
 
 @contextmanager
-def options_named(model: type[Settings], names: Sequence[str]) -> Iterator[None]:
-    """What settings refuse is told with the options as they are typed, of these of their fields."""
-    shown = {name: _shown(model, name) for name in names}
+def options_named(shown: Mapping[str, str]) -> Iterator[None]:
+    """What settings refuse is told with the options as they are typed, by the fields that they are
+    of.
+    """
     try:
         yield
     except SettingsError as error:
@@ -111,10 +112,11 @@ def options_named(model: type[Settings], names: Sequence[str]) -> Iterator[None]
 
 def _shown(model: type[Settings], name: str) -> str:
     """A field as it stands on a line: an option, or an argument as the help calls it."""
-    return name.upper() if model.model_fields[name].is_required() else _flag(name)
+    return name.upper() if model.model_fields[name].is_required() else flag(name)
 
 
-def _flag(name: str) -> str:
+def flag(name: str) -> str:
+    """The option of a setting, e.g. `--range-max` of `range_max`."""
     return f"--{name.replace('_', '-')}"
 
 
@@ -131,7 +133,7 @@ def _option(model: type[Settings], name: str, own: dict[str, Any]) -> inspect.Pa
     known = model.model_fields[name]
     needed = known.is_required()
     old = OLD_FLAGS.get(name)
-    flags = [_flag(name), *([f"--{old}"] if old else [])]
+    flags = [flag(name), *([f"--{old}"] if old else [])]
     panel = LOGS if name in LogOptions.model_fields else None
     how: Any = (
         typer.Argument(help=help_of(known))

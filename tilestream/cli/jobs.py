@@ -106,7 +106,7 @@ def estimate(
     It ends by printing what the estimates are worth, the headline, and where the report is. The
     same command continues a job that was stopped. `tilestream run` learns from drives too.
     """
-    with options_named(RunSettings, ()):
+    with options_named({"out": "--out"}):
         settings = estimate_settings(
             sources, route, folder, model, places, seeing, labels, which_map, report
         )

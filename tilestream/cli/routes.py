@@ -8,7 +8,7 @@ import typer
 
 from tilestream.apps import compare as comparing
 from tilestream.cli.cluster import HERE, Cluster, on_cluster
-from tilestream.cli.fields import fields, was_given, with_settings
+from tilestream.cli.fields import fields, flag, options_named, was_given, with_settings
 from tilestream.cli.options import AsJson, DryRun, Routes, StoreUrl, numbers, routes_of
 from tilestream.cli.printing import out, print_json, say, say_notes
 from tilestream.cli.progress import progress
@@ -68,6 +68,10 @@ BlindRears = Annotated[
         "--blind-rear-deg", "--blind-rear", help="Blind sectors at the rear [deg], e.g. 0,120."
     ),
 ]
+
+
+OF_CHOICES = ("range_max", "blind_rear_deg", "scan_leaf")
+"""Settings of choices that are options of a comparison."""
 
 
 @on_cluster
@@ -285,13 +289,14 @@ def compare(
         notes = noticed(notes, {MATCHER: registration.notes})
         say_notes({MATCHER: registration.notes})
         own = None if was_given(context, "cell_size") else registration.resolution
-        choices = comparing.choices_of(
-            [sensor_of(name) for name in sensor],
-            numbers(ranges, "--range-max") or (None,),
-            numbers(blind_rear, "--blind-rear-deg"),
-            numbers(cell_size, "--cell-size") if own is None else [own],
-            numbers(leaves, "--scan-leaf") or (None,),
-        )
+        with options_named({name: flag(name) for name in OF_CHOICES}):
+            choices = comparing.choices_of(
+                [sensor_of(name) for name in sensor],
+                numbers(ranges, "--range-max") or (None,),
+                numbers(blind_rear, "--blind-rear-deg"),
+                numbers(cell_size, "--cell-size") if own is None else [own],
+                numbers(leaves, "--scan-leaf") or (None,),
+            )
         registration = registration.model_copy(update={"resolution": None})
         height, z = places.sensor_height, places.route_z
         if dry_run:
