@@ -5,12 +5,16 @@ import io
 import json
 import os
 import socket
+import subprocess
+import sys
 import threading
 import time
 import urllib.error
 import urllib.request
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import ExitStack
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +29,9 @@ from hypothesis import strategies as st
 from naps import MEMORY, Nap
 from patience import wait_until
 from PIL import Image
+from scenes import scene
 
+from tilestream.formats.points.pcd import write_pcd
 from tilestream.grid import TileKey
 from tilestream.pipeline.engine.cluster import ORIGINS, dask_client
 from tilestream.pipeline.engine.dashboard import (
@@ -325,6 +331,26 @@ def coloured(picture: Path, colour: str) -> int:
     wanted = tuple(int(colour[i : i + 2], 16) for i in (1, 3, 5))
     with Image.open(io.BytesIO(picture.read_bytes())) as image:
         return sum(count for count, rgb in image.convert("RGB").getcolors(2**24) if rgb == wanted)
+
+
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_the_page_is_there_when_its_address_is_printed(elsewhere: bool, tmp_path: Path) -> None:
+    write_pcd(tmp_path / "street.pcd", scene("canyon", 1, spacing=0.5))
+    program = [sys.executable, "-m", "tilestream", "ingest", "street.pcd", "--store", "map.zarr"]
+    with ExitStack() as stack:
+        where = ["--workers", "2"]
+        if elsewhere:
+            where = ["--scheduler", stack.enter_context(scheduler_elsewhere(1))[0]]
+        run = stack.enter_context(
+            subprocess.Popen([*program, *where], cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+        )
+        assert run.stderr is not None
+        (told,) = islice((line for line in run.stderr if line.startswith("Watch it at")), 1)
+        with urllib.request.urlopen(told.split()[-1], timeout=60.0) as page:
+            assert page.status == 200
+            assert "Tilestream" in page.read().decode()
+        run.communicate()
+    assert run.returncode == 0
 
 
 def test_machines_get_the_same_from_a_scheduler_in_another_process(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import typer
 from tilestream.cli.printing import err, say
 from tilestream.errors import UsageError
 from tilestream.pipeline.engine.cluster import LOOPBACK, TlsFiles, dask_client
-from tilestream.pipeline.engine.events import page_url
+from tilestream.pipeline.engine.events import page_url, serve_page
 
 WORKERS = "Worker processes on this machine; 1: this process does all."
 AllCores = Annotated[int | None, typer.Option(min=1, help=WORKERS, show_default="one per core")]
@@ -37,13 +37,13 @@ class Cluster:
     def client(self, memory: int) -> Iterator[Any | None]:
         """A client for tasks that use at most so much memory [bytes]; errors as `dask_client`.
 
-        Says on stderr where to watch them.
+        Says on stderr where to watch them, once the page is there.
         """
         with dask_client(
             self.scheduler, self.workers, memory, host=self.host, tls=self.tls
         ) as client:
             page = page_url(client)
-            if page is not None:
+            if page is not None and serve_page(client):
                 say(f"Watch it at {page}", to=err)
             yield client
 

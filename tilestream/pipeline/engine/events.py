@@ -24,6 +24,22 @@ def page_url(client: Any | None) -> str | None:
     return f"{link.removesuffix('status')}{NAME}" if link else None
 
 
+def serve_page(client: Any) -> bool:
+    """Have the scheduler serve the page, as it does from now on; whether it can.
+
+    One that serves it already goes on.
+    """
+    try:
+        # Bokeh is heavy, and most processes that import this one have no scheduler.
+        from tilestream.pipeline.engine.dashboard import ProgressPlugin  # noqa: PLC0415
+
+        client.register_plugin(ProgressPlugin())
+    except Exception as error:  # noqa: BLE001 - whatever the scheduler lacks
+        logger.warning("no Tilestream page on the dashboard: %s", error or repr(error))
+        return False
+    return True
+
+
 @contextmanager
 def dashboard_client(client: Any, named: Callable[[str], str]) -> Iterator["DashboardClient"]:
     """Sends a run to the scheduler, for its page: planned tasks, then their outcomes.
@@ -52,15 +68,7 @@ class DashboardClient:
         self._named = named
         self._outcomes: list[list[Any]] = []
         self._sent = time.monotonic()
-        try:
-            # Bokeh is heavy, and most processes that import this one have no scheduler.
-            from tilestream.pipeline.engine.dashboard import ProgressPlugin  # noqa: PLC0415
-
-            client.register_plugin(ProgressPlugin())
-            self._open = True
-        except Exception as error:  # noqa: BLE001 - whatever the scheduler lacks
-            logger.warning("no Tilestream page on the dashboard: %s", error or repr(error))
-            self._open = False
+        self._open = serve_page(client)
 
     def plan(self, tasks: Sequence[Task]) -> None:
         """Send the tasks of a plan."""
