@@ -32,6 +32,14 @@ class Nowhere:
 
 
 @dataclass(frozen=True)
+class There(Nowhere):
+    """What is to be written there was written before."""
+
+    def known(self, _: str) -> Facts | None:
+        return {"result": "of before"}
+
+
+@dataclass(frozen=True)
 class After:
     """Something that is read once a task has made it."""
 
@@ -149,6 +157,7 @@ def Nap(
     notes: str = "",
     work: int = 1,
     gate: str = "",
+    done: bool = False,
 ) -> Task:
     """A task of a stage, for a tile."""
     what = {"seconds": seconds, "later": after, "failures": failures, "how": how, "notes": notes}
@@ -156,7 +165,7 @@ def Nap(
     return Task(
         NAPS[stage],
         str(tile),
-        Nowhere(),
+        There() if done else Nowhere(),
         takes={"key": f"{stage}-{tile}", **what},
         reads={"after": After(needs)},
         work=work,

@@ -7,6 +7,8 @@ import re
 import signal
 import subprocess
 import sys
+import time
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,7 +22,7 @@ from elsewhere import certificates, scheduler_elsewhere
 from logs import START, pose
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from patience import PATIENCE, wait_until
+from patience import PATIENCE
 from points import write_ply
 from rich.console import Console
 from scenes import PLACES, in_map
@@ -219,8 +221,9 @@ def test_a_run_that_is_terminated_says_so_and_takes_its_workers_along(
         text=True,
         start_new_session=True,
     )
+    assert process.stderr is not None
+    assert any(line.startswith("Watch it at") for line in process.stderr)  # the workers are there
     book = tmp_path / "run" / "run.json"
-    wait_until(book.exists, "the run has begun")
     workers = psutil.Process(process.pid).children(recursive=True)
     assert len(workers) >= 2
     if whole_group:
@@ -384,6 +387,50 @@ def test_options_that_would_say_nothing_are_refused(
     assert run(["ingest", str(pcd), "--store", str(tmp_path / "map.zarr"), *told]) == 2
     assert reason in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def processes_of(*arguments: object) -> tuple[int, int]:
+    """The exit code of a command in a process of its own, and how many more it started."""
+    program = [sys.executable, "-m", "tilestream", *map(str, arguments)]
+    started: set[int] = set()
+    with psutil.Popen(program, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as command:
+        while command.poll() is None:
+            with suppress(psutil.NoSuchProcess):
+                started |= {child.pid for child in command.children(recursive=True)}
+            time.sleep(0.1)
+    return command.returncode, len(started)
+
+
+def test_only_a_command_that_has_something_to_do_starts_processes(
+    pcd: Path, store: str, tmp_path: Path
+) -> None:
+    few = ("--store", tmp_path / "map.zarr", "--tile-size", "20", "--workers", "2")
+    code, started = processes_of("ingest", pcd, *few)
+    assert code == 0
+    assert started >= 2
+    assert processes_of("ingest", pcd, *few) == (0, 0)
+    assert processes_of("ingest", pcd, "--store", store, "--workers", "2") == (2, 0)
+
+
+def test_a_command_whose_work_is_done_needs_no_workers(
+    pcd: Path, log: Path, store: str, tmp_path: Path, capsys: Told
+) -> None:
+    route = tmp_path / "route.csv"
+    route.write_text("x,y,z\n8,0,0\n12,0,0\n")
+    for number, line in enumerate(
+        (
+            ["factors", store, "--route", str(route), "--spacing", "2"],
+            ["localize", store, str(log), "--radius", "0.4", "--until-s", "3"],
+            ["estimate", store, "--route", str(route), "--spacing", "4", "--model", "physics"],
+        )
+    ):
+        again = [*line, "--out", str(tmp_path / str(number))]
+        assert run([*again, "--workers", "1"]) == 0
+        first = capsys.readouterr().out
+        assert run([*again, "--workers", "2"]) == 0
+        told = capsys.readouterr()
+        assert told.out == first
+        assert "Watch it at" not in told.err
 
 
 # --- ingest

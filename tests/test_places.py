@@ -207,7 +207,8 @@ def test_a_run_directory_on_s3(
     before = names_in(here)
     the_job_is_there(settings, capsys)
     gate = ["run", str(here / "job.yaml"), "--workers", "2", "--fail-over", "0.000001"]
-    (here / "job.yaml").write_text(json.dumps(settings.model_dump(mode="json")))
+    other = settings.model_dump(mode="json") | {"spacing": 2.0}  # so that workers have work
+    (here / "job.yaml").write_text(json.dumps(other))
     assert command(gate) == 1
     assert "sample points have no estimate" in capsys.readouterr().err
     assert Files.at(f"{settings.out}/dask-performance.html").there()

@@ -8,6 +8,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from random import Random
@@ -27,10 +28,11 @@ from patience import wait_until
 from tilestream.errors import PlanError, TaskError, UsageError
 from tilestream.grid import TileKey
 from tilestream.pipeline.engine.attempt import Outcome
-from tilestream.pipeline.engine.cluster import dask_client, report_kept
+from tilestream.pipeline.engine.cluster import dask_client, late_client, report_kept
 from tilestream.pipeline.engine.dask_executor import _Workers
 from tilestream.pipeline.engine.executor import execute
 from tilestream.pipeline.engine.frontier import Frontier
+from tilestream.pipeline.engine.late_client import LateClient
 from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.engine.stage import BASE_BYTES, Task
 
@@ -114,6 +116,57 @@ def test_watchers_see_the_work_of_each_stage() -> None:
 def test_no_cluster_is_started_for_one_worker() -> None:
     with dask_client(None, 1, 10**9) as client:
         assert client is None
+
+
+def row(tasks: int, *, done: bool, stage: str = "nap", needs: tuple[str, ...] = ()) -> list[Task]:
+    return [Nap(TileKey(i, 0), stage, needs=needs, done=done) for i in range(tasks)]
+
+
+def test_what_is_done_starts_no_worker_and_few_tasks_start_few(
+    workers: distributed.Client, tmp_path: Path
+) -> None:
+    started: list[int] = []
+
+    @contextmanager
+    def start(count: int) -> Iterator[distributed.Client]:
+        started.append(count)
+        yield workers
+
+    after = row(5, done=True, stage="after", needs=("nap-0_0", "nap-1_0"))
+    with LateClient(8, start) as late, report_kept(late, tmp_path / "dask.html"):
+        seen: list[tuple[int, int]] = []
+        plan = planned([*row(9, done=True), *after])
+        there = execute(plan, late, lambda _, *counts: seen.append(counts))
+        assert all(outcome.ok and not outcome.made for outcome in there)
+        assert seen[:3] == [(1, 9), (2, 9), (1, 5)]
+
+        def more(outcome: Outcome) -> list[Task]:
+            return row(4, done=True, stage="cells") if outcome.stage == "nap" else []
+
+        assert len(execute(planned(row(1, done=True)), late, None, grow=more)) == 5
+        assert started == []
+    assert not (tmp_path / "dask.html").exists()
+    with LateClient(8, start) as late, report_kept(late, tmp_path / "dask.html"):
+        some = planned([*row(9, done=True), *row(3, done=False, stage="cells")])
+        assert [o.made for o in execute(some, late, None)] == [False] * 9 + [True] * 3
+        assert execute(planned(row(9, done=True)), late, None)[8].facts == {"result": "of before"}
+    assert started == [3]
+    assert "<html" in (tmp_path / "dask.html").read_text()[:200]
+
+
+def test_more_tasks_get_more_workers_up_to_what_there_may_be() -> None:
+    ran_by: dict[int, int] = {}
+
+    def more(outcome: Outcome) -> list[Task]:
+        ran_by[len(ran_by)] = len(client.for_tasks(0).scheduler_info()["workers"])
+        return row(9, done=False, stage="after") if outcome.stage == "nap" else []
+
+    with late_client(None, 2, MEMORY) as client:
+        assert all(o.ok for o in execute(planned(row(1, done=False)), client, None, grow=more))
+        made = client.for_tasks(0)
+        wait_until(lambda: len(made.scheduler_info()["workers"]) == 2, "a second worker")
+        assert len(made.cluster.worker_spec) == 2
+    assert ran_by[0] == 1
 
 
 def test_a_plan_names_the_task_that_does_not_fit() -> None:

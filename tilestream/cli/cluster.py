@@ -12,8 +12,9 @@ import typer
 
 from tilestream.cli.printing import err, say
 from tilestream.errors import UsageError
-from tilestream.pipeline.engine.cluster import LOOPBACK, TlsFiles, dask_client
+from tilestream.pipeline.engine.cluster import LOOPBACK, TlsFiles, late_client
 from tilestream.pipeline.engine.events import page_url, serve_page
+from tilestream.pipeline.engine.late_client import around
 
 WORKERS = "Worker processes on this machine; 1: this process does all."
 AllCores = Annotated[int | None, typer.Option(min=1, help=WORKERS, show_default="one per core")]
@@ -35,17 +36,22 @@ class Cluster:
 
     @contextmanager
     def client(self, memory: int) -> Iterator[Any | None]:
-        """A client for tasks that use at most so much memory [bytes]; errors as `dask_client`.
+        """A client for tasks that use at most so much memory [bytes]; errors as `late_client`.
 
-        Says on stderr where to watch them, once the page is there.
+        As soon as it is made, says on stderr where to watch them.
         """
-        with dask_client(
-            self.scheduler, self.workers, memory, host=self.host, tls=self.tls
-        ) as client:
-            page = page_url(client)
-            if page is not None and serve_page(client):
-                say(f"Watch it at {page}", to=err)
+        where = late_client(self.scheduler, self.workers, memory, host=self.host, tls=self.tls)
+        with where as client, around(client, _watched):
             yield client
+
+
+@contextmanager
+def _watched(client: Any) -> Iterator[None]:
+    """Print where to watch what a client does, once the page is there."""
+    page = page_url(client)
+    if page is not None and serve_page(client):
+        say(f"Watch it at {page}", to=err)
+    yield
 
 
 HERE, ALL_CORES = Cluster(workers=1), Cluster()

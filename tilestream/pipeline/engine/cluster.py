@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import dask.config
@@ -20,6 +21,7 @@ from distributed.comm.core import CommClosedError
 from distributed.utils import silence_logging_cmgr
 
 from tilestream.errors import TaskError, UsageError
+from tilestream.pipeline.engine.late_client import LateClient, around
 from tilestream.pipeline.engine.plan import megabytes
 from tilestream.pipeline.engine.seen import require_blocking
 
@@ -76,7 +78,7 @@ class _DeafToInterrupts(distributed.WorkerPlugin):
 
 
 @contextmanager
-def dask_client(
+def late_client(
     scheduler: str | None,
     workers: int | None,
     memory: int,
@@ -84,7 +86,8 @@ def dask_client(
     host: str = LOOPBACK,
     tls: TlsFiles | None = None,
 ) -> Iterator[Any | None]:
-    """A Dask client, or None where the tasks run in this process.
+    """A client of a scheduler that runs, a late one of our own (`LateClient`), or None where the
+    tasks run in this process.
 
     Args:
         scheduler: address of a running scheduler, e.g. `tcp://10.0.0.1:8786` or `tls://…`; None: a
@@ -98,7 +101,7 @@ def dask_client(
             know; for a scheduler elsewhere, Dask's configuration says (`distributed.comm.tls`).
 
     Raises:
-        TaskError: nobody answers at the scheduler's address, or no worker can be started.
+        TaskError: nobody answers at the scheduler's address.
         UsageError: the scheduler's address is none, certificates are missing or do not fit, or
             temporary files cannot be written.
     """
@@ -111,32 +114,58 @@ def dask_client(
         with silence_logging_cmgr(logging.CRITICAL), _connected(scheduler, security) as client:
             yield client
     elif count > 1:
-        if host != LOOPBACK:
-            logger.warning(
-                "scheduler and dashboard listen on %s: whoever reaches them can watch the run, "
-                "though only certificates let them act",
-                host,
-            )
-        told = "starting %d workers, encrypted; the first time, they compile kernels for a minute"
-        logger.info(told, count)
-        with (
-            _local_cluster(
-                n_workers=count,
-                threads_per_worker=1,
-                memory_limit=2 * memory,
-                host=host,
-                dashboard_address=f"{host}:0",
-                security=security or distributed.Security.temporary(),
-                silence_logs=logging.CRITICAL,  # what failed is told once, by the outcomes
-                env=ONE_THREAD,
-            ) as cluster,
-            distributed.Client(cluster) as client,
-        ):
-            client.register_plugin(_DeafToInterrupts())
-            logger.debug("%d workers of %s each", count, megabytes(2 * memory))
-            yield client
+        _require_scratch()
+        with LateClient(count, partial(_own_workers, memory, host, security)) as late:
+            yield late
     else:
         yield None
+
+
+@contextmanager
+def dask_client(
+    scheduler: str | None,
+    workers: int | None,
+    memory: int,
+    *,
+    host: str = LOOPBACK,
+    tls: TlsFiles | None = None,
+) -> Iterator[Any | None]:
+    """A Dask client, made at once, or None where the tasks run in this process.
+
+    Arguments and errors as of `late_client` and `LateClient.for_tasks`.
+    """
+    with late_client(scheduler, workers, memory, host=host, tls=tls) as client:
+        yield client.for_tasks(client.most) if isinstance(client, LateClient) else client
+
+
+@contextmanager
+def _own_workers(memory: int, host: str, security: Any | None, count: int) -> Iterator[Any]:
+    """Start so many workers on this machine; a client of their cluster."""
+    if host != LOOPBACK:
+        logger.warning(
+            "scheduler and dashboard listen on %s: whoever reaches them can watch the run, "
+            "though only certificates let them act",
+            host,
+        )
+    started = "a worker" if count == 1 else f"{count:,} workers"
+    told = "starting %s, encrypted; the first time, they compile kernels for a minute"
+    logger.info(told, started)
+    with (
+        _local_cluster(
+            n_workers=count,
+            threads_per_worker=1,
+            memory_limit=2 * memory,
+            host=host,
+            dashboard_address=f"{host}:0",
+            security=security or distributed.Security.temporary(),
+            silence_logs=logging.CRITICAL,  # what failed is told once, by the outcomes
+            env=ONE_THREAD,
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        client.register_plugin(_DeafToInterrupts())
+        logger.debug("%s of %s each", started, megabytes(2 * memory))
+        yield client
 
 
 @contextmanager
@@ -146,7 +175,6 @@ def _local_cluster(host: str, **how: Any) -> Iterator[Any]:
     Dask's default, `*`, lets any site in the browser of someone who can reach it listen. Other
     names, of a proxy or a tunnel, can be given in Dask's configuration.
     """
-    _require_scratch()
     given = [origin for origin in dask.config.get(ORIGINS) if origin != "*"]
     with dask.config.set({ORIGINS: given}):
         try:
@@ -238,16 +266,20 @@ def report_kept(client: Any | None, path: str | os.PathLike[str]) -> Iterator[No
     """Keep Dask's own performance report of what runs inside, as one HTML file.
 
     Args:
-        client: a Dask client; None: there is nothing to report.
+        client: a Dask client, maybe a late one; None, or never made: there is nothing to report.
         path: the file, or its URL, replaced; where Dask cannot make it any more (the scheduler is
             lost), a warning says so and nothing else is disturbed.
 
     Raises:
         UsageError: the client is asynchronous.
     """
-    if client is None:
+    with around(client, lambda made: _performance_report(made, path)):
         yield
-        return
+
+
+@contextmanager
+def _performance_report(client: Any, path: str | os.PathLike[str]) -> Iterator[None]:
+    """The report of a client that is there, as `report_kept`."""
     require_blocking(client)
     report = distributed.performance_report(filename=os.fspath(path), mode="inline")
     with client.as_current():

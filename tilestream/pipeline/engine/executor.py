@@ -2,14 +2,14 @@
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack
 from functools import partial
 from typing import Any
 
-from tilestream.pipeline.engine.attempt import Outcome, attempt
+from tilestream.pipeline.engine.attempt import Outcome, attempt, found
 from tilestream.pipeline.engine.dask_executor import DaskNames, run_on_dask
-from tilestream.pipeline.engine.events import dashboard_client
+from tilestream.pipeline.engine.events import DashboardClient, dashboard_client
 from tilestream.pipeline.engine.frontier import RETRIES, Frontier
+from tilestream.pipeline.engine.late_client import LateClient, client_for
 from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.engine.seen import require_blocking, require_seen
 from tilestream.pipeline.engine.stage import Task
@@ -43,7 +43,8 @@ def execute(
 
     Args:
         plan: what to run; a need that is not among its tasks counts as done.
-        client: a Dask client; None: one by one in this process.
+        client: a Dask client, maybe a late one, which is made when there is something to do;
+            None: one by one in this process.
         watch: is told of each outcome.
         grow: adds tasks to the plan while it runs.
         shared: folders and stores that all workers must see, also those that come later.
@@ -59,41 +60,77 @@ def execute(
         TaskError: the scheduler was lost, or has had no worker for too long. What is done is
             marked: the same command continues.
     """
-    if client is not None:
-        require_blocking(client)
-    frontier, names = Frontier(retries), DaskNames()
-    work: dict[str, int] = {}
-    total: Counter[str] = Counter()
-    done: Counter[str] = Counter()
-    ended: dict[str, Outcome] = {}
-    with ExitStack() as stack:
-        if client is None:
-            running, page = _run_here(frontier, plan.memory), None
-        else:
-            meet = partial(require_seen, client, shared, inputs)
-            running = run_on_dask(frontier, client, names, plan.memory, patience, meet)
-            page = stack.enter_context(dashboard_client(client, names))
+    run = _Run(plan.tasks, client, watch, grow, Frontier(retries))
+    if client is None:
+        run.hear(_run_here(run.frontier, plan.memory))
+        return run.outcomes
+    if isinstance(client, LateClient):  # it stays unmade where all is done already
+        run.hear(run.frontier.sifted(found))
+        run.hear(run.frontier.refusals())
+        if not run.frontier.left:
+            return run.outcomes
+    made, names = client_for(client, run.frontier.left), DaskNames()
+    require_blocking(made)
+    meet = partial(require_seen, made, shared, inputs)
+    with dashboard_client(made, names) as page:
+        run.show(page)
+        run.hear(run_on_dask(run.frontier, made, names, plan.memory, patience, meet))
+    return run.outcomes
 
-        def add(tasks: Iterable[Task]) -> None:
-            more = list(tasks)
-            frontier.add(more)
-            for task in more:
-                work[task.key] = task.work
-                total[task.stage] += task.work
-            if page is not None and more:
-                page.plan(more)
 
-        add(plan.tasks)
-        for outcome in running:
-            ended[outcome.key] = outcome
-            done[outcome.stage] += work[outcome.key]
-            if page is not None:
-                page.learn(outcome)
-            if watch is not None:
-                watch(outcome, done[outcome.stage], total[outcome.stage])
-            if grow is not None:
-                add(grow(outcome))
-    return [ended[key] for key in work]
+class _Run:
+    """What a run knows of its tasks while they end, wherever that is."""
+
+    def __init__(
+        self,
+        tasks: Iterable[Task],
+        client: Any | None,
+        watch: Watch | None,
+        grow: Grow | None,
+        frontier: Frontier,
+    ) -> None:
+        self.frontier = frontier
+        self._client, self._watch, self._grow = client, watch, grow
+        self._page: DashboardClient | None = None
+        self._tasks: dict[str, Task] = {}
+        self._ended: dict[str, Outcome] = {}
+        self._total: Counter[str] = Counter()
+        self._done: Counter[str] = Counter()
+        self._add(tasks)
+
+    @property
+    def outcomes(self) -> list[Outcome]:
+        """In the order of the tasks."""
+        return [self._ended[key] for key in self._tasks]
+
+    def show(self, page: DashboardClient) -> None:
+        """From now on, tell a page what it is told here; first, what has been so far."""
+        self._page = page
+        page.plan(list(self._tasks.values()))
+        for outcome in self._ended.values():
+            page.learn(outcome)
+
+    def hear(self, outcomes: Iterable[Outcome]) -> None:
+        """Take outcomes as they come, and add the tasks that they lead to."""
+        for outcome in outcomes:
+            self._ended[outcome.key] = outcome
+            self._done[outcome.stage] += self._tasks[outcome.key].work
+            if self._page is not None:
+                self._page.learn(outcome)
+            if self._watch is not None:
+                self._watch(outcome, self._done[outcome.stage], self._total[outcome.stage])
+            if self._grow is not None:
+                self._add(self._grow(outcome))
+
+    def _add(self, tasks: Iterable[Task]) -> None:
+        more = list(tasks)
+        self.frontier.add(more)
+        for task in more:
+            self._tasks[task.key] = task
+            self._total[task.stage] += task.work
+        if self._page is not None and more:
+            self._page.plan(more)
+            client_for(self._client, self.frontier.left)  # which may need more workers now
 
 
 def _run_here(frontier: Frontier, memory: int) -> Iterator[Outcome]:

@@ -1,7 +1,7 @@
 """Which tasks may run now, as outcomes come in."""
 
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from itertools import islice
 
@@ -61,6 +61,27 @@ class Frontier:
     def idle(self) -> bool:
         """Whether nothing is left to run or to tell, but for what others run."""
         return not self._ready and not self._refused
+
+    @property
+    def left(self) -> int:
+        """How many tasks have not ended, those that run included."""
+        return len(self._tasks)
+
+    def sifted(self, found: Callable[[Task], Outcome | None]) -> Iterator[Outcome]:
+        """The outcomes of the tasks that need not run, and may be looked for by now.
+
+        Args:
+            found: the outcome of a task whose work is done already; None: it has to run.
+        """
+        to_run: list[Task] = []
+        while self._ready:
+            task = self._ready.popleft()
+            outcome = found(task)
+            if outcome is None:
+                to_run.append(task)
+            else:
+                yield from self.learn(outcome)
+        self._ready.extend(to_run)
 
     def refusals(self) -> Iterator[Outcome]:
         """The outcomes of tasks that were refused as they came."""

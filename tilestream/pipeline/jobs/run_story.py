@@ -7,8 +7,9 @@ import joblib
 
 from tilestream.files import Files
 from tilestream.model.shipped import SHIPPED
-from tilestream.pipeline.engine.attempt import Outcome
+from tilestream.pipeline.engine.attempt import Outcome, found
 from tilestream.pipeline.engine.executor import Watch, execute
+from tilestream.pipeline.engine.late_client import client_for
 from tilestream.pipeline.engine.plan import Plan, paths_of
 from tilestream.pipeline.engine.stage import Task
 from tilestream.pipeline.jobs.estimator import LABELS, Estimator, estimator_of
@@ -234,10 +235,10 @@ def _is_large(estimate: Plan) -> bool:
 def estimate_large(plan: Plan, client: Any | None, watch: Watch) -> None:
     """Estimate with a forest that all workers grow together, through joblib: the same trees."""
     trains = Plan(plan.outputs("train"), plan.memory)
-    if client is None:
+    if client is None or all(found(task) for task in trains.tasks):
         outcomes = execute(trains, None, watch)
     else:
-        with client.as_current(), joblib.parallel_config(backend="dask"):
+        with client_for(client, LARGE).as_current(), joblib.parallel_config(backend="dask"):
             outcomes = execute(trains, None, watch)
     if all(outcome.ok for outcome in outcomes):
         begun = {outcome.key for outcome in outcomes}
