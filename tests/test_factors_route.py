@@ -265,4 +265,4 @@ def test_the_command(
     far = route_of("far", np.array([[200.0, 0.0, np.nan], [290.0, 0.0, np.nan]]))
     write_geojson_route(tmp_path / "route.geojson", [far])
     assert run([*command, "--spacing", "60"]) == 1
-    assert "1 m to raise the sample point from: 2 sample points" in capsys.readouterr().err
+    assert "1 m to raise the sample point from (far 0, far 1)" in capsys.readouterr().err

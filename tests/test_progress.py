@@ -29,3 +29,16 @@ def test_elsewhere_it_tells_lines_and_failures(capsys: pytest.CaptureFixture[str
     with ts.progress() as watch:
         watch(Outcome("merge-0_1", "merge", reason="a lost disk"), 2, 3)
     assert "failed merge-0_1: a lost disk" in capsys.readouterr().err
+
+
+def test_equal_failures_are_told_once_and_what_was_not_run_is_no_failure(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with ts.progress() as watch:
+        for tile in ("0_1", "0_2", "0_3"):
+            watch(Outcome(f"merge-{tile}", "merge", reason="a lost disk"), 1, 3)
+            not_run = f"not run, since merge-{tile} failed: a lost disk"
+            watch(Outcome(f"cells-{tile}", "cells", reason=not_run), 1, 3)
+        watch(Outcome("merge-0_4", "merge", reason="cut short"), 4, 4)
+    told = capsys.readouterr().err.splitlines()
+    assert told == ["failed merge-0_1: a lost disk", "failed merge-0_4: cut short"]

@@ -4,8 +4,12 @@ A message says what is wrong, where, and what to do about it. Each class is also
 exception that a caller would expect, so `except FileNotFoundError` works as usual.
 """
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+
+NOT_RUN = "not run, since "
+"""How the reason of what was not even tried begins, since something that it needs had failed."""
 
 
 class TilestreamError(Exception):
@@ -111,14 +115,73 @@ class PartialError(TaskError):
     """A job that ended with some of its work failed; everything else is done and usable."""
 
     def __init__(self, what: str, failures: dict[str, str]) -> None:
-        lines = "".join(f"\n  {name}: {reason}" for name, reason in sorted(failures.items()))
-        super().__init__(what + lines)
+        """What it says: a line for each reason (`alike`).
+
+        Args:
+            what: of which job some failed.
+            failures: every failure: reasons by name.
+        """
+        super().__init__(what + "".join(f"\n  {line}" for line in alike(failures)))
         self.what = what
         self.failures = failures
 
     def with_more(self, failures: dict[str, str]) -> "PartialError":
         """The same, with what failed besides."""
         return PartialError(self.what, {**failures, **self.failures})
+
+
+NAMED = 3
+"""Names that are told of those with the same reason."""
+OF_A_KIND = re.compile(r"(tile|scan|route|drive|sample point)( )(.+)|([a-z_]+)(-)([^./]+)")
+"""The name of one of a kind, or of a task of a stage."""
+OF_ANOTHER = re.compile(rf"{NOT_RUN}\S+ failed: ")
+"""How the reason of a task begins that was not run."""
+
+
+def alike(failures: Mapping[str, str]) -> list[str]:
+    """What failed, a line for each reason, in the order of the names; last, what was not run.
+
+    Where several have a reason, that says how many and names the first of them:
+    `12 tiles: no space left (3_4, 3_5, 3_6, …)`. What was not run is told by the reason for which
+    what it needs had failed.
+
+    Args:
+        failures: reasons by name: of a task, a file, `tile 3_4`, `scan 7`, …
+    """
+    names_of: dict[str, list[str]] = {}
+    for name in sorted(failures, key=lambda n: (failures[n].startswith(NOT_RUN), _by_number(n))):
+        reason = OF_ANOTHER.sub(f"{NOT_RUN}what they need failed: ", failures[name])
+        names_of.setdefault(reason, []).append(name)
+    return [
+        f"{names[0]}: {failures[names[0]]}" if len(names) == 1 else _together(names, reason)
+        for reason, names in names_of.items()
+    ]
+
+
+def counted(failures: Mapping[str, str], what: str = "") -> str:
+    """How many failed, and how many were not run because of that: `3 tasks failed`."""
+    not_run = sum(reason.startswith(NOT_RUN) for reason in failures.values())
+    told = f"{len(failures) - not_run:,} {what} failed".replace("  ", " ")
+    return told + (f", {not_run:,} were not run" if not_run else "")
+
+
+def _together(names: list[str], reason: str) -> str:
+    """Several names with one reason, on a line."""
+    parts = [OF_A_KIND.fullmatch(name) for name in names]
+    kinds = {(part[1] or part[4], part[2] or part[5]) for part in parts if part}
+    told, shown = f"{len(names):,} alike", names[:NAMED]
+    if len(kinds) == 1 and all(parts):
+        ((kind, between),) = kinds
+        told = f"{len(names):,} {kind}s" if between == " " else f"{len(names):,} of {kind}"
+        shown = [part[3] or part[6] for part in parts[:NAMED] if part]
+    more = ", …" if len(names) > NAMED else ""
+    return f"{told}: {reason} ({', '.join(shown)}{more})"
+
+
+def _by_number(name: str) -> list[tuple[bool, int, str]]:
+    """Sorts names as people do: scan 9 is before scan 10."""
+    parts = re.findall(r"\d+|\D+", name)
+    return [(not part.isdecimal(), int(part) if part.isdecimal() else 0, part) for part in parts]
 
 
 COPY_AGAIN = "copy it again from where it came from"

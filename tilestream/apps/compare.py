@@ -13,7 +13,7 @@ from typing import Any
 
 import pandas as pd
 
-from tilestream.errors import PartialError, UsageError
+from tilestream.errors import PartialError, UsageError, counted
 from tilestream.factors.rows import in_route_order
 from tilestream.files import place_of
 from tilestream.grid import MM_PER_M, whole_mm
@@ -193,7 +193,7 @@ def compare(
         tables[path.rsplit("/", 3)[1]].append(path)
     failures = make_tables(plan, out, client, watch)
     if failures:
-        raise PartialError(f"{out}: {len(failures)} tasks failed, the rest is done:", failures)
+        raise PartialError(f"{out}: {counted(failures, 'tasks')}, the rest is done:", failures)
     order = [route.route_id for route in routes]
     rows = pd.concat(
         [rows_of(choice, tables[choice.name], order, store) for choice in choices],

@@ -39,18 +39,20 @@ class Rate(ProgressColumn):
 
 @contextmanager
 def progress() -> Iterator[Watch]:
-    """Progress of each stage while a job runs, on stderr or in a notebook; failures are printed as
-    they happen.
+    """Progress of each stage while a job runs, on stderr or in a notebook; of failures with the
+    same reason the first is printed when it happens.
 
     Examples:
         >>> with ts.progress() as watch:
         ...     store = ts.ingest(["street.pcd"], "small.zarr", tile_size=20.0, watch=watch)
     """
+    known: set[str] = set()
     with _bars() if err.is_terminal or err.is_jupyter else _lines() as show:
 
         def watch(outcome: Outcome, ended: int, total: int) -> None:
             show(outcome.stage, ended, total)
-            if not outcome.ok:
+            if not outcome.ok and not outcome.refused and outcome.reason not in known:
+                known.add(outcome.reason)
                 err.print("failed", style="red", end="")
                 told = outcome.details if "--debug" in sys.argv else outcome.reason
                 err.print(f" {outcome.key}: {told or outcome.reason}", highlight=False)

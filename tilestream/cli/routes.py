@@ -234,8 +234,11 @@ def factors(
             out.print(factor_table(rows))
             say(f"The tables are in {folder}/factors")
         if counts.get("done", 0) < len(rows):
-            bad = rows[rows["status"] != "done"].groupby("reason").size()
-            reasons = {str(reason): f"{count} sample points" for reason, count in bad.items()}
+            bad = rows[rows["status"] != "done"]
+            names = (
+                f"sample point {r} {n}" for r, n in zip(bad.route_id, bad["sample"], strict=True)
+            )
+            reasons = dict(zip(names, bad["reason"], strict=True))
             raise PartialError(f"{store}: not every sample point has factors:", reasons)
 
 

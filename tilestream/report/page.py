@@ -12,6 +12,7 @@ from bokeh.resources import Resources
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from tilestream.errors import alike
 from tilestream.notes import shared
 from tilestream.report import charts, evaluation, formatting
 from tilestream.report.colours import ACTUAL, CRITERION, HELD_OUT, OTHER
@@ -49,6 +50,7 @@ def _environment() -> Environment:
         formatting.fact,
     )  # fmt: skip
     environment.filters |= {function.__name__: function for function in filters}
+    environment.filters["alike"] = alike
     environment.filters["base64"] = lambda data: base64.b64encode(data).decode("ascii")
     environment.tests["known"] = formatting.known
     environment.globals |= {"cm_span": formatting.cm_span, "evaluation": evaluation}

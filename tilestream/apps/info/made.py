@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from tilestream.apps.info.record import Info, Kind
-from tilestream.errors import TilestreamError
+from tilestream.errors import TilestreamError, alike
 from tilestream.files import Files
 from tilestream.marks import unsealed
 from tilestream.model.card import card_told
@@ -121,7 +121,7 @@ def _record(path: str) -> tuple[Mapping[str, Any], str]:
 
 
 def _failed(record: Mapping[str, Any]) -> list[str]:
-    return [f"failed: {name}: {reason}" for name, reason in record.get("failures", {}).items()]
+    return [f"failed: {line}" for line in alike(record.get("failures", {}))]
 
 
 def _of_model(path: str, _: LogOptions) -> Info:

@@ -7,13 +7,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from tilestream.errors import TileNotReadyError, TilestreamError
+from tilestream.errors import NOT_RUN, TileNotReadyError, TilestreamError
 from tilestream.pipeline.engine.outputs import Facts, Made, TileArrays
 from tilestream.pipeline.engine.plan import require_fit
 from tilestream.pipeline.engine.stage import BASE_BYTES, Task
 
-NOT_RUN = "not run, since "
-"""How the reason of a task begins that was refused because of another one."""
 STANDING = (FileExistsError, IsADirectoryError, NotADirectoryError, PermissionError)
 """What the disk refuses in the same way however often it is asked."""
 

@@ -5,7 +5,8 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from itertools import islice
 
-from tilestream.pipeline.engine.attempt import NOT_RUN, Outcome
+from tilestream.errors import NOT_RUN
+from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.stage import Task
 
 RETRIES = 2

@@ -9,7 +9,7 @@ import pandas as pd
 from scipy.spatial import cKDTree
 
 from tilestream.crs import require_same
-from tilestream.errors import PartialError, TileNotReadyError
+from tilestream.errors import PartialError, TileNotReadyError, counted
 from tilestream.factors.catalogue import Which
 from tilestream.factors.own import OwnFactors
 from tilestream.factors.rows import Samples, in_route_order, samples_by_tile
@@ -303,5 +303,5 @@ def _tables_of(
     tables = paths_of(plan.outputs(stage))
     if failures:
         folder = tables[0].rsplit("/", 1)[0]
-        raise PartialError(f"{folder}: {len(failures)} tasks failed, the rest is done:", failures)
+        raise PartialError(f"{folder}: {counted(failures, 'tasks')}, the rest is done:", failures)
     return in_route_order(read_tables(tables), [route.route_id for route in routes])

@@ -12,6 +12,7 @@ from tilestream.errors import (
     SourceError,
     StoreNotFoundError,
     UsageError,
+    counted,
 )
 from tilestream.formats.logs import ScanSelection
 from tilestream.lock import only_writer
@@ -96,7 +97,7 @@ def ingest(
         failures = reading.close(outcomes)
     if failures:
         raise PartialError(
-            f"{reading.store.url}: {len(failures)} sources or tiles failed, the rest is done:",
+            f"{reading.store.url}: {counted(failures, 'sources or tiles')}, the rest is done:",
             failures,
         )
     return reading.store

@@ -10,7 +10,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from tilestream.errors import PartialError, SourceNotFoundError, TileNotReadyError, UsageError
+from tilestream.errors import (
+    PartialError,
+    SourceNotFoundError,
+    TileNotReadyError,
+    UsageError,
+    counted,
+)
 from tilestream.factors.rows import Samples, samples_of_drive
 from tilestream.files import local_path, place_of
 from tilestream.formats.logs import ScanLog, ScanSelection
@@ -124,7 +130,7 @@ def localize(
     )
     failures = make_tables(plan, out, client, watch)
     if failures:
-        raise PartialError(f"{out}: {len(failures)} tasks failed, the rest is done:", failures)
+        raise PartialError(f"{out}: {counted(failures, 'tasks')}, the rest is done:", failures)
     return read_tables(paths_of(plan.outputs(label.name)))
 
 

@@ -18,7 +18,7 @@ from typing import Any
 import pandas as pd
 import yaml
 
-from tilestream.errors import PartialError
+from tilestream.errors import PartialError, counted
 from tilestream.files import place_of
 from tilestream.lock import only_writer
 from tilestream.model.dataset import Dataset
@@ -148,7 +148,7 @@ def _run(
     book.write("failed" if book.failures else "done")
     if book.failures:
         raise PartialError(
-            f"{settings.out}: {len(book.failures)} failed, the rest is done:", book.failures
+            f"{settings.out}: {counted(book.failures)}, the rest is done:", book.failures
         )
 
 

@@ -121,7 +121,7 @@ class Book:
         for outcome in self.outcomes:
             row = table[outcome.stage]
             row["tasks"] += 1
-            row["failed"] += not outcome.ok
+            row["failed"] += not outcome.ok and not outcome.refused
             row["work"] += work[outcome.key]
             row["made"] += work[outcome.key] if outcome.made else 0
             row["core_seconds"] = round(row["core_seconds"] + outcome.seconds, 3)

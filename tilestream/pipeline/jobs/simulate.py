@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from tilestream.errors import PartialError, PlanError, UsageError
+from tilestream.errors import PartialError, PlanError, UsageError, counted
 from tilestream.files import Files, local_path, place_of
 from tilestream.lock import only_writer
 from tilestream.pipeline.engine.executor import Watch, execute
@@ -113,7 +113,7 @@ def simulate(
         if not failures:
             shutil.rmtree(folder / "parts", ignore_errors=True)
     if failures:
-        raise PartialError(f"{folder}: {len(failures)} tasks failed, the rest is done:", failures)
+        raise PartialError(f"{folder}: {counted(failures, 'tasks')}, the rest is done:", failures)
     return folder
 
 
