@@ -9,7 +9,7 @@ from tilestream.pipeline.engine.attempt import Outcome, attempt, found
 from tilestream.pipeline.engine.dask_executor import DaskNames, run_on_dask
 from tilestream.pipeline.engine.events import DashboardClient, dashboard_client
 from tilestream.pipeline.engine.frontier import RETRIES, Frontier
-from tilestream.pipeline.engine.late_client import LateClient, client_for
+from tilestream.pipeline.engine.late_client import LateClient
 from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.engine.seen import require_blocking, require_seen
 from tilestream.pipeline.engine.stage import Task
@@ -60,7 +60,7 @@ def execute(
         TaskError: the scheduler was lost, or has had no worker for too long. What is done is
             marked: the same command continues.
     """
-    run = _Run(plan.tasks, client, watch, grow, Frontier(retries))
+    run = _Run(plan.tasks, watch, grow, Frontier(retries))
     if client is None:
         run.hear(_run_here(run.frontier, plan.memory))
         return run.outcomes
@@ -69,12 +69,13 @@ def execute(
         run.hear(run.frontier.refusals())
         if not run.frontier.left:
             return run.outcomes
-    made, names = client_for(client, run.frontier.left), DaskNames()
-    require_blocking(made)
-    meet = partial(require_seen, made, shared, inputs)
-    with dashboard_client(made, names) as page:
+        client = client.for_tasks(run.frontier.left if grow is None else client.most)
+    names = DaskNames()
+    require_blocking(client)
+    meet = partial(require_seen, client, shared, inputs)
+    with dashboard_client(client, names) as page:
         run.show(page)
-        run.hear(run_on_dask(run.frontier, made, names, plan.memory, patience, meet))
+        run.hear(run_on_dask(run.frontier, client, names, plan.memory, patience, meet))
     return run.outcomes
 
 
@@ -84,13 +85,12 @@ class _Run:
     def __init__(
         self,
         tasks: Iterable[Task],
-        client: Any | None,
         watch: Watch | None,
         grow: Grow | None,
         frontier: Frontier,
     ) -> None:
         self.frontier = frontier
-        self._client, self._watch, self._grow = client, watch, grow
+        self._watch, self._grow = watch, grow
         self._page: DashboardClient | None = None
         self._tasks: dict[str, Task] = {}
         self._ended: dict[str, Outcome] = {}
@@ -130,7 +130,6 @@ class _Run:
             self._total[task.stage] += task.work
         if self._page is not None and more:
             self._page.plan(more)
-            client_for(self._client, self.frontier.left)  # which may need more workers now
 
 
 def _run_here(frontier: Frontier, memory: int) -> Iterator[Outcome]:

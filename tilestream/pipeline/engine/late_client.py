@@ -19,24 +19,21 @@ class LateClient:
         self.when_made: list[Callable[[Any], object]] = []
         """What the client is told to as soon as it is made."""
         self._start = start
-        self._workers = 0
         self._client: Any = None
         self._stack = ExitStack()
 
     def for_tasks(self, count: int) -> Any:
         """The Dask client, with a worker for each of so many tasks, as far as there may be so many.
 
+        The first who asks decides: a cluster that grows while it is closed may never end.
+
         Raises:
             TaskError, UsageError: no worker can be started.
         """
-        wanted, before = min(count, self.most), self._workers
-        self._workers = max(wanted, before)
         if self._client is None:
-            self._client = self._stack.enter_context(self._start(wanted))
+            self._client = self._stack.enter_context(self._start(min(count, self.most)))
             for begin in self.when_made:
                 begin(self._client)
-        elif wanted > before:
-            self._client.cluster.scale(wanted)
         return self._client
 
     def __enter__(self) -> Self:
