@@ -642,7 +642,7 @@ LEARNING = "out: run\nmap: {sources: [a.pcd]}\nroutes: [r.csv]\nsimulate: {}\n"
             r"matcher fast: no such matcher or file.*autoware, default",
         ),
         (LEARNING + "sensor: {name: x, range_mx: 3}", r"range_mx is no .*did you mean range_max"),
-        (LEARNING + "sensor: {name: x}", r"sensor.*: range_max is .*Field required"),
+        (LEARNING + "sensor: {name: x}", r"sensor.*: range_max is missing"),
         (LEARNING + "drives: {log: a.mcap}", r"drives is .*valid tuple"),
         ("just words", r"give the fields of a job"),
         ("out: [", r"no readable YAML"),
