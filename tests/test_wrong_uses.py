@@ -73,7 +73,7 @@ USES: list[tuple[str, int, str]] = [
     (f"{OF_LOG} --every 0", 2, "--every, 0"),
     (f"{OF_LOG} --every 2 --offset 2", 2, "every, offset"),
     (f"{OF_LOG} --from-s 5 --until-s 2", 2, "--from-s 5, --until-s 2, later"),
-    (f"{OF_LOG} --from-s 500", 1, "drive.mcap, 500, last 2.0 s"),
+    (f"{OF_LOG} --from-s 500", 1, "drive.mcap, is selected, 500, last 2.0 s"),
     (f"{OF_LOG} --points-topic /camera", 1, "/camera, /points"),
     (f"{OF_LOG} --pose-topic /camera", 1, "/camera, /odometry"),
     (f"{OF_LOG} --map-frame moon", 1, "moon, --map-frame map"),

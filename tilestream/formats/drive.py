@@ -107,9 +107,10 @@ def open_drive(
     selected = scans.indices(log.stamps_ns)
     if not log.posed[selected].any():
         lasts = (log.stamps_ns[-1] - log.stamps_ns[0]) / 1e9 if len(log) else 0.0
+        has = "has a pose, of those selected" if len(selected) else "is selected"
         raise PoseError(
-            f"{path}: {len(selected)} of its {len(log)} scans, which last {lasts:.1f} s, are "
-            f"selected ({scans}), and none of these has a pose: select others"
+            f"{path}: none of its {len(log)} scans, which last {lasts:.1f} s, {has} ({scans}): "
+            "select others"
         )
     return DriveSource(log, scans, range_max)
 

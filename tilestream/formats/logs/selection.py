@@ -47,7 +47,8 @@ class ScanSelection:
 
     def __str__(self) -> str:
         parts = [
-            f"scans {self.start} to {self.stop}" * (self.start > 0 or self.stop is not None),
+            f"from scan {self.start} on" * (self.start > 0),
+            f"before scan {self.stop}" * (self.stop is not None),
             f"every {self.every} from {self.offset} on" * (self.every > 1),
             f"from {self.from_s:g} s on" * (self.from_s > 0.0),
             f"until {self.until_s} s" * (self.until_s is not None),
