@@ -115,7 +115,7 @@ def main(edge: int, replaced: list[int], size: float, spacing: float) -> None:
         print("|---" * (len(STAGES) + 4) + "|")
         whole, made = run(job(folder, folder / "run", size, spacing))
         row("from nothing", whole, whole, made, edge**2, edge)
-        for count in replaced:
+        for count in (0, *replaced):
             replace(folder, count, size)
             seconds, made = run(job(folder, folder / "run", size, spacing))
             row(str(count), seconds, whole, made, count, edge)

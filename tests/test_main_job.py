@@ -180,6 +180,7 @@ def test_the_run_tells_what_it_did(done: tuple[Path, Told]) -> None:
         "tasks": 1,
         "failed": 0,
         "work": 1,
+        "made": 1,
         "core_seconds": 0,
     }
     assert "above the ground of the map" not in str(told["notes"])
