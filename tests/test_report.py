@@ -34,7 +34,7 @@ from tilestream.formats import open_source
 from tilestream.model.features import SPREAD_ACROSS, SPREAD_ALONG, WEAK_ALONG
 from tilestream.records import Float64
 from tilestream.report import Findings, gate, write_report
-from tilestream.report.charts import MOST, city_map
+from tilestream.report.city_map import MOST, city_map
 from tilestream.report.colours import FIXED, MISSING, THRESHOLDS, scale_of
 from tilestream.report.exports import write_csv, write_geoparquet
 from tilestream.report.lines import with_gaps

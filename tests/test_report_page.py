@@ -34,7 +34,7 @@ from tilestream.model.dataset import TARGETS
 from tilestream.model.registry import COMPETITORS
 from tilestream.model.splits import PROTOCOLS
 from tilestream.report import Findings, write_report
-from tilestream.report.charts import city_map
+from tilestream.report.city_map import city_map
 from tilestream.report.evaluation import MODELS, PAPER_IMPORTANCES, PARTS, PROTOCOL_NAMES, worth
 from tilestream.report.formatting import cm, cm_by_name, cm_span, percent
 from tilestream.report.page import report_page

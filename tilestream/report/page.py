@@ -15,6 +15,7 @@ from markupsafe import Markup
 from tilestream.errors import alike
 from tilestream.notes import shared
 from tilestream.report import charts, evaluation, formatting
+from tilestream.report.city_map import city_map, map_shows_every
 from tilestream.report.colours import ACTUAL, CRITERION, HELD_OUT, OTHER
 from tilestream.report.comparison import QUANTILE, Comparison
 from tilestream.report.data import AROUND, Findings
@@ -82,7 +83,7 @@ def report_page(
     return _render(
         "report.html.j2",
         content,
-        [charts.city_map(found, tip)]
+        [city_map(found, tip)]
         + [charts.path_chart(found, path["path"], f"path-{k}") for k, path in enumerate(paths)],
         cards=cards(content),
         digits=digits_of(content),
@@ -92,7 +93,7 @@ def report_page(
         absent=_absent(content, ends),
         pictures=pictures,
         ends=ends,
-        shown_every=charts.map_shows_every(found),
+        shown_every=map_shows_every(found),
         own_range=found.own_range,
         bridge=BRIDGE,
         apart=APART,
