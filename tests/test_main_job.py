@@ -833,7 +833,7 @@ def test_the_page_of_a_run_answers_to_the_mouse(done: tuple[Path, Told]) -> None
     top = len(data["arc"]) - 1
     with chromium_page() as tab:
         opened(tab, page)
-        assert tab.evaluate("document.documentElement.dataset.charts") == str(1 + len(STREETS))
+        assert tab.evaluate("document.documentElement.dataset.charts") == str(1 + 2 * len(STREETS))
         point_at(tab, "city-map", "in_domain", top)
         tip = tab.wait_for(TIPS)
         words = [data[name][top] for name in ("shown", "interval", "fail", "axes", "starts")]

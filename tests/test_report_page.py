@@ -83,7 +83,7 @@ def test_every_section_is_there_in_order_and_says_something(
     source = path.read_text(encoding="utf-8")
     there = re.findall(r'<section id="([^"]+)">', source)
     assert there == re.findall(r'<a href="#([^"]+)">', source)
-    assert len(there) == {"whole": 13, "hostile": 13}.get(name, 5)
+    assert len(there) == {"whole": 14, "hostile": 14, "nothing_estimated": 5}.get(name, 6)
     for section in there:
         assert len(text_of(path, section)) > 80, section
 
@@ -434,7 +434,7 @@ def test_a_browser_shows_every_chart_and_answers_to_the_mouse(
     browser: Page, found: Findings, page: Path
 ) -> None:
     tab = opened(browser, page)
-    assert tab.evaluate("document.documentElement.dataset.charts") == "3"
+    assert tab.evaluate("document.documentElement.dataset.charts") == "5"
     assert tab.evaluate("document.documentElement.scrollWidth <= innerWidth")
     data = source(charts(page)["city-map"], "in_domain")
     top = len(data["arc"]) - 1  # drawn last, so nothing of it is hidden
@@ -461,7 +461,8 @@ def test_a_browser_shows_what_lacks_something(
     browser: Page, others: dict[str, Path], name: str
 ) -> None:
     tab = opened(browser, others[name])
-    assert tab.evaluate("document.querySelectorAll('section').length") == 5
+    sections = 5 if name == "nothing_estimated" else 6
+    assert tab.evaluate("document.querySelectorAll('section').length") == sections
     calm(tab)
 
 
@@ -551,3 +552,43 @@ def test_a_worst_place_is_shown_on_the_map_and_its_address_can_be_sent(
     )
     assert found_again == pytest.approx([x, y, wide, high], rel=0.02)
     assert again.errors == []
+
+
+def test_a_profile_holds_the_estimates_of_its_route(found: Findings, page: Path) -> None:
+    for number, (name, rows) in enumerate(worst_routes(found)):
+        chart = charts(page)[f"along-{number}"]
+        data, kept = source(chart, "profile"), rows.sort_values("arc_length")
+        np.testing.assert_array_equal(data["arc"], kept["arc_length"])
+        np.testing.assert_allclose(data["estimate"], 100.0 * kept["estimate"])
+        np.testing.assert_array_equal(data["x"], kept["x"])
+        assert f"along-{number}" in page.read_text(encoding="utf-8"), name
+
+
+def worst_routes(found: Findings) -> list[tuple[str, pd.DataFrame]]:
+    parts = [(str(name), part) for name, part in found.places.groupby("route_id")]
+    return sorted(parts, key=lambda one: -one[1]["estimate"].quantile(0.95))
+
+
+def test_a_click_into_a_profile_shows_the_place_on_the_map(
+    browser: Page, found: Findings, page: Path
+) -> None:
+    tab = opened(browser, page)
+    view = "[...Bokeh.index.roots].find((v) => document.getElementById('along-0').contains(v.el))"
+    tab.wait_for(f"{view}.frame.bbox.width > 100")
+    tab.evaluate(f"{view}.el.scrollIntoView({{block: 'center', behavior: 'instant'}})")
+    _, rows = worst_routes(found)[0]
+    place = rows.sort_values("arc_length").iloc[20]
+    at = tab.evaluate(
+        f"(() => {{ const view = {view}; const box = view.el.getBoundingClientRect();"
+        f"return [box.left + view.frame.x_scale.compute({place['arc_length']}),"
+        " box.top + view.frame.bbox.vcenter] })()"
+    )
+    where = {"x": at[0], "y": at[1], "button": "left", "clickCount": 1}
+    for kind in ("mousePressed", "mouseReleased"):
+        tab.command("Input.dispatchMouseEvent", type=kind, **where)
+    said = tab.wait_for("location.hash.startsWith('#x=') && location.hash")
+    x, y = (float(part[2:]) for part in said[1:].split("&"))
+    assert (x, y) == pytest.approx(
+        (place["x"], place["y"]), abs=1.1
+    )  # the nearest place, 1 m apart
+    assert tab.errors == []

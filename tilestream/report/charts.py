@@ -23,9 +23,10 @@ from tilestream.report.colours import (
     HELD_OUT,
 )
 from tilestream.report.comparison import Comparison
-from tilestream.report.data import Findings
-from tilestream.report.formatting import CM_PER_M, cm
+from tilestream.report.data import Findings, estimates
+from tilestream.report.formatting import CM_PER_M, cm, cm_about, cm_span
 from tilestream.report.lines import path_lines, points_per_mark, with_gaps, worst_of_every
+from tilestream.report.measured import measure_of
 
 MOST_POINTS = 2_000
 """Points of a line; of more, the worst of every few."""
@@ -66,6 +67,50 @@ def path_chart(found: Findings, path: str, target: str) -> dict[str, Any]:
         plot.line("arc", "estimate", source=source, **style)
     anchor = plot.line("arc", "anchor", source=source, line_alpha=0.0)
     plot.add_tools(hover(anchor, PATH_TIP, mode="vline"))
+    finish(plot)
+    return item(plot, target)
+
+
+def profile_chart(found: Findings, route_id: str, target: str) -> dict[str, Any]:
+    """The estimate along a route with its interval, and squares where errors were measured; of a
+    long route the worst of every few places. A click shows the place on the map.
+
+    The data sources are named `profile` and `measured`; lengths in centimetres, x and y [m, map
+    frame].
+    """
+    plot = _new_road(270, "error [cm]")
+    plot.name = "profile"  # by which the page finds it
+    rows = found.places[found.places["route_id"].astype(str) == route_id]
+    estimate, measured = estimates(rows), measure_of(rows).measured
+    every = points_per_mark(len(rows), MOST_POINTS)
+    kept = worst_of_every(every, rows["route_id"], np.fmax(estimate, measured))
+    rows, estimate, measured = rows.iloc[kept], estimate[kept], measured[kept]
+    low, high = (rows[name].to_numpy(np.float64) for name in ("low", "high"))
+    columns: dict[str, Any] = {
+        "arc": rows["arc_length"].to_numpy(np.float64),
+        "estimate": estimate * CM_PER_M,
+        "low": low * CM_PER_M,
+        "high": high * CM_PER_M,
+        "measured": [cm(error) for error in measured],
+        "shown": [cm_about(error, found.digits) for error in estimate],
+        "interval": [cm_span(a, b, found.digits) for a, b in zip(low, high, strict=True)],
+        **{axis: rows[axis].to_numpy(np.float64) for axis in "xy"},
+    }
+    _band(plot, columns)
+    source = ColumnDataSource(columns, name="profile")
+    of_line: dict[str, Any] = {"color": HELD_OUT, "line_width": 1.8, "legend_label": "estimate"}
+    line = plot.line("arc", "estimate", source=source, **of_line)
+    there = np.flatnonzero(np.isfinite(measured))
+    if there.size:
+        squares = {"arc": columns["arc"][there], "error": measured[there] * CM_PER_M}
+        style: dict[str, Any] = {
+            "marker": "square",
+            "size": 6,
+            "color": ACTUAL,
+            "legend_label": "measured",
+        }
+        plot.scatter("arc", "error", source=ColumnDataSource(squares, name="measured"), **style)
+    plot.add_tools(hover(line, PATH_TIP, mode="vline"))
     finish(plot)
     return item(plot, target)
 

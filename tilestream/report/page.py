@@ -26,6 +26,8 @@ from tilestream.report.summary import AXES, STARTS, cards, digits_of
 
 MOST_ROUTES = 40
 """Routes that the page lists, the worst by their 95 % quantile; `report.json` has all."""
+MOST_PROFILES = 12
+"""Routes that have a profile, likewise."""
 MOST_SEGMENTS = 15
 """Segments that the page lists; the file has all."""
 MOST_CHARTS = 24
@@ -79,17 +81,24 @@ def report_page(
     """
     paths = content["paths"][:MOST_CHARTS]
     segments = sorted(content["segments"], key=lambda s: (-s["worst"], s["route_id"], s["begin"]))
+    profiles = [route for route in _worst_first(content["routes"]) if route["p95"] is not None]
+    profiles = profiles[:MOST_PROFILES]
     tip = _ENVIRONMENT.get_template("map_tip.html.j2").render()
     return _render(
         "report.html.j2",
         content,
         [city_map(found, tip)]
+        + [
+            charts.profile_chart(found, route["route_id"], f"along-{k}")
+            for k, route in enumerate(profiles)
+        ]
         + [charts.path_chart(found, path["path"], f"path-{k}") for k, path in enumerate(paths)],
         cards=cards(content),
         digits=digits_of(content),
         routes=_listed_routes(content["routes"]),
         segments=segments[:MOST_SEGMENTS],
         paths=paths,
+        profiles=profiles,
         absent=_absent(content, ends),
         pictures=pictures,
         ends=ends,
@@ -113,6 +122,7 @@ def _absent(content: Mapping[str, Any], ends: bytes | str) -> dict[str, str]:
     )
     unlabelled = "no place was labelled: without a log of scans there is no measured error"
     why = {
+        "along": (content["headline"]["estimated"], "no place has an estimate"),
         "paths": (content["paths"], unlabelled),
         "ends": (isinstance(ends, bytes), str(ends)),
         "table-i": (content["table_i"], unlabelled),
@@ -182,7 +192,12 @@ def _policy(scripts: Sequence[str]) -> str:
 def _listed_routes(routes: list[dict[str, Any]]) -> list[dict[str, Any]]:
     if len(routes) <= MOST_ROUTES:
         return routes
-    return sorted(routes, key=lambda r: (-(r["p95"] or 0.0), r["route_id"]))[:MOST_ROUTES]
+    return _worst_first(routes)[:MOST_ROUTES]
+
+
+def _worst_first(routes: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """By the 95 % quantile of their estimates."""
+    return sorted(routes, key=lambda r: (-(r["p95"] or 0.0), r["route_id"]))
 
 
 def _listed_tiles(tiles: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -56,6 +56,23 @@
     document.getElementById("map").scrollIntoView();
   }
 
+  // A click into a profile names the nearest place of it.
+  function listen(profile) {
+    const places = [...profile.references()].find((model) => model.name === "profile" && model.data);
+    profile.on_event("tap", (event) => {
+      const { arc, x, y } = places.data;
+      let nearest = -1;
+      for (let k = 0; k < arc.length; k++) {
+        if (Number.isFinite(x[k]) && !(Math.abs(arc[k] - event.x) >= Math.abs(arc[nearest] - event.x))) {
+          nearest = k;
+        }
+      }
+      if (nearest >= 0) {
+        location.hash = `x=${x[nearest].toFixed(1)}&y=${y[nearest].toFixed(1)}`;
+      }
+    });
+  }
+
   Bokeh.set_log_level("warn");
   const items = [...document.querySelectorAll("script.chart-data")].map((s) => JSON.parse(s.textContent));
   Promise.all(items.map((item) => Bokeh.embed.embed_item(item))).then(() => {
@@ -63,6 +80,11 @@
     dark.addEventListener("change", paint);
     window.addEventListener("beforeprint", paint);
     window.addEventListener("afterprint", paint);
+    for (const root of Bokeh.documents.flatMap((doc) => doc.roots())) {
+      if (root.name === "profile") {
+        listen(root);
+      }
+    }
     window.addEventListener("hashchange", go);
     go();
     document.documentElement.dataset.charts = String(items.length);
