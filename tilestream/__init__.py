@@ -18,32 +18,11 @@ of each other (registration is chaotic); what is averaged over starts, or learnt
 with them.
 """
 
+import sys
 from importlib import import_module
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from tilestream.factors.observability import observability
-from tilestream.factors.sample_points import sample_points
-from tilestream.factors.table import factors
-from tilestream.formats.logs import ScanSelection
-from tilestream.formats.routes import read_all_routes, read_route, read_routes
-from tilestream.grid import TileKey
-from tilestream.label import (
-    disc_starts,
-    localization_error,
-    refined_pose,
-    start_poses,
-)
-from tilestream.matcher import RegistrationSettings
-from tilestream.ndt import cells_of
-from tilestream.pipeline.jobs.along_routes import factors_along, observe_along
-from tilestream.pipeline.jobs.ingest import ingest
-from tilestream.pipeline.jobs.localize import localize
-from tilestream.pipeline.jobs.starts_of import starts_of
-from tilestream.records import Cells, Column, LocalizationError, Registrations, Route
-from tilestream.registration import register
-from tilestream.sensor import HDL64, OS1_128, VLP16, Sensor
-from tilestream.settings import LogOptions, StartSettings, VirtualSettings
-from tilestream.store import Tile, TileStore, open_store
 from tilestream.version import VERSION
 
 if TYPE_CHECKING:
@@ -56,10 +35,33 @@ if TYPE_CHECKING:
     from tilestream.apps.view import view
     from tilestream.cli.progress import progress
     from tilestream.definitions import explain
+    from tilestream.factors.observability import observability
+    from tilestream.factors.sample_points import sample_points
+    from tilestream.factors.table import factors
+    from tilestream.formats.logs import ScanSelection
+    from tilestream.formats.routes import read_all_routes, read_route, read_routes
+    from tilestream.grid import TileKey
+    from tilestream.label import (
+        disc_starts,
+        localization_error,
+        refined_pose,
+        start_poses,
+    )
+    from tilestream.matcher import RegistrationSettings
+    from tilestream.ndt import cells_of
+    from tilestream.pipeline.jobs.along_routes import factors_along, observe_along
     from tilestream.pipeline.jobs.estimate import estimate
+    from tilestream.pipeline.jobs.ingest import ingest
+    from tilestream.pipeline.jobs.localize import localize
     from tilestream.pipeline.jobs.run import dataset, run
     from tilestream.pipeline.jobs.run_settings import RunSettings
+    from tilestream.pipeline.jobs.starts_of import starts_of
     from tilestream.pipeline.jobs.train_over import train_over
+    from tilestream.records import Cells, Column, LocalizationError, Registrations, Route
+    from tilestream.registration import register
+    from tilestream.sensor import HDL64, OS1_128, VLP16, Sensor
+    from tilestream.settings import LogOptions, StartSettings, VirtualSettings
+    from tilestream.store import Tile, TileStore, open_store
 
 __all__ = [
     "HDL64",
@@ -132,13 +134,31 @@ _LATE = {
     "apps.view": ("view",),
     "cli.progress": ("progress",),
     "definitions": ("explain",),
+    "factors.observability": ("observability",),
+    "factors.sample_points": ("sample_points",),
+    "formats.logs": ("ScanSelection",),
+    "formats.routes": ("read_all_routes", "read_route", "read_routes"),
+    "grid": ("TileKey",),
+    "label": ("disc_starts", "localization_error", "refined_pose", "start_poses"),
+    "matcher": ("RegistrationSettings",),
+    "ndt": ("cells_of",),
+    "pipeline.jobs.along_routes": ("factors_along", "observe_along"),
     "pipeline.jobs.estimate": ("estimate",),
+    "pipeline.jobs.ingest": ("ingest",),
+    "pipeline.jobs.localize": ("localize",),
     "pipeline.jobs.run": ("dataset", "run"),
     "pipeline.jobs.run_settings": ("RunSettings",),
+    "pipeline.jobs.starts_of": ("starts_of",),
     "pipeline.jobs.train_over": ("train_over",),
+    "records": ("Cells", "Column", "LocalizationError", "Registrations", "Route"),
+    "registration": ("register",),
+    "sensor": ("HDL64", "OS1_128", "Sensor", "VLP16"),
+    "settings": ("LogOptions", "StartSettings", "VirtualSettings"),
+    "store": ("Tile", "TileStore", "open_store"),
 }
-"""What is imported when it is asked for: what it needs (scikit-learn, Bokeh, matplotlib) would cost
-every worker process 100 MB that its tiles have a use for."""
+"""What is imported when it is asked for: the list of commands needs none of it, and what some of it
+needs (scikit-learn, Bokeh, matplotlib) would cost every worker process 100 MB that its tiles have a
+use for."""
 
 
 def __getattr__(name: str) -> Any:
@@ -150,6 +170,22 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return list(__all__)
+
+
+class _Api(ModuleType):
+    """The one function of the API that has the name of a folder, which Python sets here."""
+
+    @property
+    def factors(self) -> Any:
+        """As the others, imported when it is asked for."""
+        return import_module("tilestream.factors.table").factors
+
+    @factors.setter
+    def factors(self, folder: ModuleType) -> None:
+        """The folder is found by its imports without."""
+
+
+sys.modules[__name__].__class__ = _Api
 
 
 __version__ = VERSION
