@@ -12,7 +12,7 @@ import tilestream
 ROOT = Path(tilestream.__file__).parent
 FLOORS = (
     ("errors", "version"),
-    ("bounded_yaml", "config", "crs", "files", "grid", "marks", "notebook", "notes"),
+    ("bounded_yaml", "config", "crs", "files", "grid", "marks", "notebook", "notes", "user_cache"),
     ("kernels", "lock"),
     ("autoware_matcher", "sensor"),
     ("matcher", "records"),

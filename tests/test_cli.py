@@ -2,6 +2,7 @@
 
 import io
 import json
+import logging
 import os
 import re
 import signal
@@ -118,7 +119,7 @@ def test_the_list_of_commands_says_what_each_says_of_itself() -> None:
 
 
 def test_the_list_of_commands_comes_without_what_they_need() -> None:
-    heavy = "{'sklearn', 'bokeh', 'matplotlib'} & set(sys.modules)"
+    heavy = "{'numpy', 'pandas', 'dask', 'sklearn', 'bokeh', 'matplotlib'} & set(sys.modules)"
     code = f"import sys; from tilestream.cli import run; run(['--help']); sys.exit(bool({heavy}))"
     listed = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
     assert listed.returncode == 0
@@ -194,6 +195,60 @@ def test_a_traceback_only_with_debug(tmp_path: Path, capsys: Told) -> None:
     assert "Traceback" not in plain.err
     assert "Traceback" in debug.err
     assert plain.err in debug.err
+
+
+@pytest.fixture
+def bad_log(log: Path, tmp_path: Path) -> Path:
+    """A log cut short, of which a note says so."""
+    return damaged(log, tmp_path / "cut.mcap", keep=0.6)
+
+
+@pytest.mark.parametrize("before", [False, True])
+def test_quiet_leaves_results_and_errors(
+    before: bool, bad_log: Path, store: str, tmp_path: Path, capsys: Told
+) -> None:
+    line = ["localize", store, str(bad_log), "--radius", "0.4", "--json"]
+    assert run([*line, "--out", str(tmp_path / "told")]) == 0
+    told = capsys.readouterr()
+    assert "note: " in told.err
+    quietly = ["--quiet", *line] if before else [*line, "--quiet"]
+    assert run([*quietly, "--out", str(tmp_path / "quiet")]) == 0
+    quiet = capsys.readouterr()
+    assert quiet.out == told.out
+    assert "cut short" in quiet.out  # what was noticed is in the JSON
+    assert quiet.err == ""
+    assert run([*quietly, "--out", str(bad_log)]) == 2
+    assert capsys.readouterr().err.startswith("error: ")
+    assert run([*line, "--out", str(tmp_path / "told")]) == 0
+    assert "note: " in capsys.readouterr().err  # it was for that line alone
+
+
+@pytest.mark.parametrize(
+    ("options", "levels"),
+    [
+        ([], {"INFO", "WARNING", "ERROR"}),
+        (["--quiet"], {"ERROR"}),
+        (["--log-level", "debug"], {"DEBUG", "INFO", "WARNING", "ERROR"}),
+        (["--log-level=error"], {"ERROR"}),
+        (["--quiet", "--log-level", "warning"], {"WARNING", "ERROR"}),
+    ],
+)
+def test_log_lines_are_shown_from_a_level_on(
+    options: list[str],
+    levels: set[str],
+    pcd: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    def logged(*_: object) -> None:
+        for level in ("DEBUG", "INFO", "WARNING", "ERROR"):
+            logging.getLogger("tilestream.apps").log(getattr(logging, level), "x")
+        raise UsageError("enough")
+
+    monkeypatch.setattr("tilestream.apps.info.info", logged)
+    assert run(["info", str(pcd), *options]) == 2
+    assert {record.levelname for record in caplog.records} == levels
+    assert run(["info", str(pcd), "--log-level", "loud"]) == 2
 
 
 def test_an_interrupt_is_told_in_one_line(

@@ -5,7 +5,6 @@ Exit codes: 0 all good; 1 some sources, tiles or scans failed and are listed, th
 """
 
 import errno
-import logging
 import signal
 import sys
 import threading
@@ -15,10 +14,11 @@ from importlib import import_module
 from typing import Annotated, Any
 
 import typer
-from rich.logging import RichHandler
 from typer.core import TyperGroup
 
-from tilestream.cli.printing import err, out, say
+from tilestream.cli.completion import completable
+from tilestream.cli.printing import errors, out, say
+from tilestream.cli.telling import OF_EVERY_COMMAND, Debug, LogLevel, Quiet, telling
 from tilestream.errors import (
     PlanError,
     SourceNotFoundError,
@@ -111,9 +111,19 @@ class LateCommands(TyperGroup):
             return super().invoke(ctx)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
-        """The command of a line."""
+        """The command of a line; where the line is completed, what can be completed of it."""
         name, command, rest = super().resolve_command(ctx, args)
-        return name, command and command_of(str(name)), rest
+        if command is None:
+            return name, None, rest
+        if ctx.resilient_parsing:
+            return name, _made(str(name), completable(str(name), function_of)), rest
+        return name, command_of(str(name)), rest
+
+
+def function_of(name: str) -> Any:
+    """The function of a command, from its file."""
+    file, _ = COMMANDS[name]
+    return getattr(import_module(f"tilestream.cli.{file}"), name)
 
 
 @contextmanager
@@ -133,17 +143,22 @@ def _typers_errors() -> Iterator[None]:
 
 def command_of(name: str) -> Any:
     """A command with all its options."""
-    file, _ = COMMANDS[name]
+    return _made(name, function_of(name))
+
+
+def _made(name: str, function: Any) -> Any:
     alone = typer.Typer(add_completion=False, rich_markup_mode=MARKUP)
-    alone.command(name)(getattr(import_module(f"tilestream.cli.{file}"), name))
-    return typer.main.get_command(alone)
+    alone.command(name)(function)
+    command = typer.main.get_command(alone)
+    everywhere = [p for p in typer.main.get_command(app).params if p.name in OF_EVERY_COMMAND]
+    command.params += everywhere
+    return command
 
 
 app = typer.Typer(
     name="tilestream",
     cls=LateCommands,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=MARKUP,
     epilog="Begin with `tilestream estimate map.pcd --route route.tum`, or with `tilestream demo`, "
@@ -156,14 +171,12 @@ for _name, (_, _told) in COMMANDS.items():
 @app.callback(invoke_without_command=True)
 def root(
     version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
-    debug: Annotated[  # noqa: ARG001 - `run` takes it from anywhere on the line
-        bool, typer.Option("--debug", help="With any command: show the traceback of an error.")
-    ] = False,
+    debug: Debug = False,  # noqa: ARG001 - these three are told to `telling`
+    quiet: Quiet = False,  # noqa: ARG001
+    log_level: LogLevel = None,  # noqa: ARG001
 ) -> None:
     """The localization error of a LiDAR vehicle at every metre, from the map alone."""
-    plain = RichHandler(console=err, show_time=False, show_level=False, show_path=False)
-    logging.basicConfig(format="%(message)s", handlers=[plain])
-    logging.getLogger("tilestream").setLevel(logging.INFO)
+    telling.apply()
     if version:
         out.print(VERSION, highlight=False)
         raise typer.Exit
@@ -210,21 +223,25 @@ def main() -> None:
 
 def run(arguments: list[str]) -> int:
     """Run a command line and return its exit code."""
-    debug = "--debug" in arguments
+    with telling.anew():
+        return _run(arguments)
+
+
+def _run(arguments: list[str]) -> int:
     try:
-        app(args=[a for a in arguments if a != "--debug"], prog_name="tilestream")
+        app(args=arguments, prog_name="tilestream")
     except SystemExit as end:
         if end.code in (INTERRUPTED, TERMINATED):
-            say("stopped; the same command continues where it was", to=err)
+            say("stopped; the same command continues where it was", to=errors)
         return int(end.code or 0)
     except Exception as error:
         if _was_terminated(error):  # and something failed on the way out
-            say("stopped; the same command continues where it was", to=err)
+            say("stopped; the same command continues where it was", to=errors)
             return TERMINATED
         if isinstance(error, UsageError | SourceNotFoundError | StoreNotFoundError | PlanError):
-            return _report(error, debug, 2)
+            return _report(error, 2)
         if isinstance(error, TilestreamError | OSError):
-            return _report(error, debug, 1)
+            return _report(error, 1)
         raise
     return 0
 
@@ -236,9 +253,9 @@ def _was_terminated(error: BaseException | None) -> bool:
     return error is not None
 
 
-def _report(error: Exception, debug: bool, code: int) -> int:
-    if debug:
-        err.print_exception()
+def _report(error: Exception, code: int) -> int:
+    if telling.debug:
+        errors.print_exception()
     advice = OF_DISKS.get(error.errno or 0) if isinstance(error, OSError) else None
-    say(f"error: {error}{f': {advice}' if advice else ''}", to=err)
+    say(f"error: {error}{f': {advice}' if advice else ''}", to=errors)
     return code

@@ -1,4 +1,4 @@
-"""Where the commands print: facts on stdout, what happens meanwhile on stderr."""
+"""Where the commands print: facts on stdout, errors and what happens meanwhile on stderr."""
 
 import json
 import sys
@@ -47,6 +47,9 @@ class _Console(Console):
 
 out = _Console()
 err = _Console(stderr=True)
+"""What happens meanwhile: progress, notes, log lines; `--quiet` silences it."""
+errors = _Console(stderr=True)
+"""How a command ended that did not end well."""
 
 
 def say(line: str, to: Console = out) -> None:

@@ -1,6 +1,5 @@
 """Progress while a job runs: bars on a terminal and in a notebook, else a line now and then."""
 
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,6 +18,7 @@ from rich.progress import (
 from rich.text import Text
 
 from tilestream.cli.printing import err, say
+from tilestream.cli.telling import telling
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.executor import Watch
 
@@ -54,7 +54,7 @@ def progress() -> Iterator[Watch]:
             if not outcome.ok and not outcome.refused and outcome.reason not in known:
                 known.add(outcome.reason)
                 err.print("failed", style="red", end="")
-                told = outcome.details if "--debug" in sys.argv else outcome.reason
+                told = outcome.details if telling.debug else outcome.reason
                 err.print(f" {outcome.key}: {told or outcome.reason}", highlight=False)
 
         yield watch

@@ -4,22 +4,21 @@ Before the first run, a stage tells how long its work took in the runs of benchm
 """
 
 import json
-import os
 from collections.abc import Collection, Iterable
 from pathlib import Path
 
 from tilestream.files import Files
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.stage import Task
+from tilestream.user_cache import user_cache
 
 LEAST = 0.03
 """Tasks that took less tell nothing [s]."""
 
 
 def calibration_file() -> Path:
-    """Where this user's figures are kept: `$XDG_CACHE_HOME` (or `~/.cache`) `/tilestream`."""
-    cache = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    return Path(cache) / "tilestream" / "seconds.json"
+    """Where this user's figures are kept."""
+    return user_cache() / "seconds.json"
 
 
 def seconds_per_work() -> dict[str, float]:
