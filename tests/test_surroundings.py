@@ -12,6 +12,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import dask.config
 import distributed
 import numpy as np
 import pytest
@@ -183,6 +184,7 @@ def workers_elsewhere(
     what it sees.
     """
     with (
+        dask.config.set({"distributed.comm.timeouts.connect": f"{PATIENCE:g}s"}),
         scheduler_elsewhere(
             len(prefixes), plain=True, prefixes=prefixes, of_workers=environment
         ) as (address, _),
