@@ -99,7 +99,7 @@ def test_damaged_metadata_is_named(tmp_path: Path, old: str, new: str, message: 
 def test_metadata_that_is_no_text_is_named(tmp_path: Path) -> None:
     folder = make_map(tmp_path)
     (folder / "pointcloud_map_metadata.yaml").write_bytes(os.urandom(4) + b"\xff\xfe\x00" * 9)
-    with pytest.raises(CorruptSourceError, match="no readable YAML"):
+    with pytest.raises(CorruptSourceError, match="is no text"):
         open_source(folder)
 
 

@@ -227,6 +227,7 @@ def test_another_processor_agrees_within_what_is_stated(tmp_path: Path) -> None:
 
 MAY = {
     "apps/camera.py": "a picture, no table",
+    "apps/changes.py": "over all places of two runs, for words",
     "factors/local_similarity.py": "the weights of a fit: a constant",
     "factors/hessian.py": "6 x 6 of one place",
     "factors/virtual_drive.py": "over the starts of one place",

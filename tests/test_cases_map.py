@@ -13,7 +13,7 @@ import tilestream as ts
 from tilestream.apps.diff import diff
 from tilestream.cli import run
 from tilestream.crs import projection, same
-from tilestream.errors import CrsError, PartialError, SourceNotFoundError
+from tilestream.errors import CrsError, SourceError, SourceNotFoundError
 from tilestream.formats import describe
 from tilestream.formats.points.las import write_las
 from tilestream.formats.points.pcd import write_pcd
@@ -65,7 +65,7 @@ def test_feet_are_brought_to_metres(map_cases: Path, tmp_path: Path) -> None:
 
 
 def test_degrees_are_refused(map_cases: Path, tmp_path: Path) -> None:
-    with pytest.raises(PartialError, match=r"degrees\.las: its CRS EPSG:4326 .* in degrees"):
+    with pytest.raises(SourceError, match=r"degrees\.las: its CRS EPSG:4326 .* in degrees"):
         made(map_cases / "degrees.las", tmp_path)
     with pytest.raises(CrsError, match=r"EPSG:4326 .* in degrees: project"):
         made(map_cases / "same_crs_epsg.las", tmp_path, crs="EPSG:4326")
@@ -198,7 +198,7 @@ def test_the_map_s_own_projector_serves_its_lanes(
     (note,) = told["notes"][str(lanes)]
     assert "brought from degrees" in note
     assert planned(folder, tmp_path) == 0
-    assert "1 lanes of" in " ".join(capsys.readouterr().out.split())
+    assert "1 lane of" in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_map_of_one_cloud_is_a_map_folder(
@@ -212,7 +212,7 @@ def test_a_map_of_one_cloud_is_a_map_folder(
     assert run(["info", str(folder), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["points"] == STREET
     assert planned(folder, tmp_path) == 0
-    assert "1 lanes of" in " ".join(capsys.readouterr().out.split())
+    assert "1 lane of" in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_folder_of_clouds_without_metadata_is_a_map_folder(tmp_path: Path) -> None:

@@ -1,9 +1,11 @@
 """Intervals: they hold what they promise for new blocks, and know nothing of units."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import stats
@@ -13,6 +15,7 @@ from tilestream.model.intervals import (
     calibrate,
     coverage,
     interval_score,
+    stretch,
     wider_for_few,
     with_intervals,
 )
@@ -121,14 +124,15 @@ def test_a_higher_level_reaches_farther(
 ) -> None:
     actual, estimate = (part.ravel() for part in of)
 
-    def width(promised: float) -> float:
-        low, high = calibrate(actual, estimate, NAMES, promised).around(estimate)
+    lower, higher = (calibrate(actual, estimate, NAMES, of) for of in (level, level + more))
+    for interval in (lower, higher):
+        low, high = interval.around(estimate)
         assert (low <= estimate).all()
         assert (estimate <= high).all()
         assert (low >= 0.0).all()
-        return float((high - low).mean())
-
-    assert width(level) <= width(level + more) + 1e-12
+    assume(lower.constant == higher.constant)  # another level may ask for another shape
+    assert lower.below <= higher.below + 1e-12
+    assert lower.above <= higher.above + 1e-12
 
 
 @settings(max_examples=60, deadline=None)
@@ -255,3 +259,17 @@ def test_no_ends_score_less_than_the_quantiles(level: float, down: float, up: fl
 
     other = sorted((low + down, high + up))
     assert score(low, high) <= score(*other) + 1e-3
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_interval_holds_its_own_blocks_as_it_is(seed: int) -> None:
+    actual, estimate = (part.ravel() for part in drawn(np.random.default_rng(seed), 6, 0.3, 0.5))
+    names = np.repeat([f"b{k}" for k in range(6)], 40)
+    interval = calibrate(actual, estimate, names)
+    assert stretch(interval, actual, estimate, names) == pytest.approx(1.0)
+    wide = replace(interval, below=2.0 * interval.below, above=2.0 * interval.above)
+    assert stretch(wide, actual, estimate, names) == pytest.approx(0.5)
+    low, high = interval.around(estimate)
+    worse = estimate + np.where(actual > estimate, 3.0, 1.0) * (actual - estimate)
+    assert stretch(interval, worse, estimate, names) > 1.5
+    assert ((worse < low) | (worse > high)).mean() > 0.2

@@ -11,9 +11,10 @@ import yaml
 from scenes import PLACES
 from streets import job, write_drive
 from streets import street as street_of
+from typer.main import get_command
 
 from tilestream.cli import run
-from tilestream.cli.app import COMMANDS, command_of
+from tilestream.cli.app import COMMANDS, app, command_of
 from tilestream.formats.points.las import write_las
 from tilestream.formats.points.pcd import write_pcd
 
@@ -123,7 +124,8 @@ def test_no_block_is_left_out() -> None:
 def test_every_option_in_the_text_is_one_of_a_command() -> None:
     text = re.sub(r"```.*?```", "", README, flags=re.DOTALL)
     named = set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", text))
-    options = {option for name in COMMANDS for p in command_of(name).params for option in p.opts}
+    commands = [get_command(app), *map(command_of, COMMANDS)]
+    options = {option for command in commands for p in command.params for option in p.opts}
     assert {"--scheduler", "--host", "--tls-ca", "--tls-cert", "--tls-key"} <= named <= options
 
 

@@ -282,7 +282,7 @@ def test_the_window_shows_map_and_route_until_it_is_closed(
         process.kill()
     assert process.returncode == 130
     assert "3 places measured (large), 2 estimated (small), 2 neither (grey)" in told
-    assert "2.0 cm" in told
+    assert "error [cm]: ██ 5 ██ 10 ██ 15 ██ 20 ██ 25 ██ 50 ██" in told
 
 
 def test_a_screenshot_has_map_and_route_in_the_colours_of_the_report(

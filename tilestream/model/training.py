@@ -17,7 +17,14 @@ from tilestream.model.dataset import TARGETS, Dataset, matrix
 from tilestream.model.domain import WIDEST, Domain, domain_of
 from tilestream.model.explain import PIECE, Typical, compared, in_words, typical_of
 from tilestream.model.features import with_derived
-from tilestream.model.intervals import LEVEL, NOT_CALIBRATED, Interval, calibrate, wider_for_few
+from tilestream.model.intervals import (
+    LEVEL,
+    NOT_CALIBRATED,
+    Interval,
+    calibrate,
+    stretch,
+    wider_for_few,
+)
 from tilestream.model.making import Outside, check_own, outside, shared
 from tilestream.model.physics import Physics, width_of
 from tilestream.model.registry import DEFAULT, OF_VIRTUAL_DRIVES, REGRESSORS
@@ -219,9 +226,7 @@ def _wider_outside(dataset: Dataset, interval: Interval) -> float:
         return WIDEST
     estimate = held_out_estimates(dataset, splits, partial(Physics.fit, target=MAIN))
     lidars = dataset.rows["lidar"].to_numpy(str)
-    unseen = calibrate(dataset.label(MAIN), estimate, lidars, LEVEL)
-    (low, high), (least, most) = (one.around(estimate) for one in (interval, unseen))
-    return float(np.clip(np.mean(most - least) / np.mean(high - low), 1.0, WIDEST))
+    return float(np.clip(stretch(interval, dataset.label(MAIN), estimate, lidars), 1.0, WIDEST))
 
 
 def predict(

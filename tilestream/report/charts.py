@@ -83,7 +83,7 @@ def profile_chart(found: Findings, route_id: str, target: str) -> dict[str, Any]
     rows = found.places[found.places["route_id"].astype(str) == route_id]
     estimate, measured = estimates(rows), measure_of(rows).measured
     every = points_per_mark(len(rows), MOST_POINTS)
-    kept = worst_of_every(every, rows["route_id"], np.fmax(estimate, measured))
+    kept = worst_of_every(every, rows["route_id"].to_numpy(), np.fmax(estimate, measured))
     rows, estimate, measured = rows.iloc[kept], estimate[kept], measured[kept]
     low, high = (rows[name].to_numpy(np.float64) for name in ("low", "high"))
     columns: dict[str, Any] = {

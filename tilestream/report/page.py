@@ -151,6 +151,7 @@ def comparison_page(found: Comparison, content: Mapping[str, Any]) -> str:
         content,
         [charts.route_chart(found, name, f"route-{k}") for k, name in enumerate(routes)],
         routes=routes,
+        absent={},
         vehicles=[(of, _listed_tiles(of["tiles"])) for of in content["cell_sizes"]],
         shown_every=charts.line_shows_every(found),
         apart=APART,
