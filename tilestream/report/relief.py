@@ -2,8 +2,8 @@
 
 import io
 
-import matplotlib as mpl
 import numpy as np
+from matplotlib.image import imsave
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 
@@ -60,5 +60,5 @@ def relief_png(found: FromAbove) -> bytes:
     """The same as PNG; the same map gives the same bytes."""
     buffer = io.BytesIO()
     options = {"metadata": {"Software": None}, "pil_kwargs": {"optimize": True}}
-    mpl.image.imsave(buffer, relief(found), format="png", **options)  # type: ignore[arg-type]
+    imsave(buffer, relief(found), format="png", **options)  # type: ignore[arg-type]
     return buffer.getvalue()
