@@ -882,3 +882,20 @@ def test_the_real_drive_is_ingested_whole(shared_data: Path, tmp_path: Path) -> 
     np.testing.assert_allclose(stored.min(axis=0), points.min(axis=0), atol=0.6e-3)
     np.testing.assert_allclose(stored.max(axis=0), points.max(axis=0), atol=0.6e-3)
     np.testing.assert_allclose(stored.mean(axis=0), points.mean(axis=0), atol=1e-4)
+
+
+def test_of_dask_s_own_log_nothing_is_shown() -> None:
+    """Whenever it is imported: its logger may have its own handler, which we silence."""
+    code = """
+import logging
+from tilestream.cli.telling import telling
+telling.apply()
+import distributed
+own = logging.getLogger("distributed").handlers
+assert own and not logging.getLogger("distributed").propagate, own
+logging.getLogger("tilestream.here").info("what we say")
+"""
+    found = subprocess.run(
+        [sys.executable, "-c", code], check=True, capture_output=True, text=True, timeout=600
+    )
+    assert found.stderr.split() == ["what", "we", "say"]

@@ -16,6 +16,7 @@ PANEL = "With any command"
 """Heading of these options in the help of each."""
 LINES = RichHandler(console=err, show_time=False, show_level=False, show_path=False)
 """Prints what is logged."""
+LINES.setFormatter(logging.Formatter("%(message)s"))
 
 
 @dataclass
@@ -31,9 +32,11 @@ class Telling:
 
     def apply(self) -> None:
         """From now on, print that much."""
-        logging.basicConfig(format="%(message)s", handlers=[LINES])
+        ours = logging.getLogger("tilestream")
+        if LINES not in ours.handlers:  # of the root it would keep Dask from silencing its own
+            ours.addHandler(LINES)
         level = self.level or ("error" if self.quiet else "info")
-        logging.getLogger("tilestream").setLevel(level.upper())
+        ours.setLevel(level.upper())
         logging.getLogger().setLevel("ERROR" if self.quiet else "WARNING")  # all other libraries
         LINES.console = errors if self.quiet else err
         err.quiet = self.quiet
