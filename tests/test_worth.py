@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import stand_in
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tilestream.pipeline.jobs.run_worth import FEW_PLACES, worth_of
@@ -92,6 +92,8 @@ entries = st.dictionaries(keys, values | st.dictionaries(st.text(max_size=3), va
 names = st.sampled_from(["real drives", "held-out paths", "held-out lidar"])
 
 
+@example({"real drives": {"mae_m": 1e308, "median_m": 1e-300}})
+@example({"real drives": {"mae_m": 1.0, "median_m": -1.0}})
 @given(st.none() | st.text(max_size=3) | st.dictionaries(names, entries | values))
 def test_a_card_may_lack_anything(checked: Any) -> None:
     found = worth(card={"checked": checked})

@@ -35,7 +35,7 @@ def relief(found: FromAbove) -> NDArray[np.uint8]:
     share = np.clip(np.floor(above / HIGH * SHADES), 0, SHADES - 1) / (SHADES - 1)
     image = np.full((*above.shape, 4), GREY, np.uint8)
     image[..., 3] = np.where(there, np.round(255.0 * (FAINT + (STRONG - FAINT) * share)), 0.0)
-    return image[::-1]
+    return np.ascontiguousarray(image[::-1])
 
 
 def _ground(found: FromAbove) -> Float64:

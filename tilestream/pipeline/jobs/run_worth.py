@@ -61,8 +61,8 @@ def worth_of(
     trained = _trained(card, facts)
     checks = _checks(labels, card, blocks, shipped, (simulated, trained["simulated"]))
     median, there = None if at is None else float(estimate[at]), checks.pop("median", None)
-    if there and median is not None and checks["mae"] is not None:
-        checks["mae"] *= median / there  # larger errors are off by more
+    if there is not None and there > 0.0 and median is not None and checks["mae"] is not None:
+        checks["mae"] = _number(checks["mae"] * median / there)  # larger ones are off by more
     return Worth(
         model=model,
         **checks,
