@@ -26,6 +26,7 @@ from tilestream.errors import PartialError, UsageError
 from tilestream.formats.points.las import write_las
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.pipeline.engine.attempt import Outcome
+from tilestream.pipeline.jobs.map_reading import GONE
 from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.report import pictures
 
@@ -370,6 +371,9 @@ def test_an_update_recomputes_what_it_reaches_and_nothing_else(how: str, copied:
         assert again <= reached(how, table) & written < written
         assert bool(again) == (how in WHERE)
     assert len(told.made("scatter")) == (how != "taken away")
+    notes = json.loads((copied / "run" / "run.json").read_text())["notes"]
+    gone = [Path(source).name for source, told_of in notes.items() if GONE in told_of]
+    assert gone == (["0.las"] if how == "taken away" else [])
     assert not [o for o in told.outcomes if o.stage == "scatter" and not o.made]
 
     found = json.loads((copied / "run" / "run.json").read_text()).get("update")

@@ -1,5 +1,6 @@
 """The job that makes a map: sources in, tile store out, in ten steps over plan and run."""
 
+import logging
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, fields
@@ -18,10 +19,12 @@ from tilestream.formats.logs import ScanSelection
 from tilestream.lock import only_writer
 from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY
-from tilestream.pipeline.jobs.map_reading import MADE_BY, Reading, remembered
+from tilestream.pipeline.jobs.map_reading import GONE, MADE_BY, Reading, remembered
 from tilestream.pipeline.jobs.sources import Source, examine_all, with_crs, within
 from tilestream.settings import IngestSettings, LogOptions
 from tilestream.store import StoreSettings, TileStore, open_store
+
+logger = logging.getLogger(__name__)
 
 
 def ingest(
@@ -120,6 +123,8 @@ def read_sources(
         store = TileStore.create(url, wanted)
     recorded = _recorded(store, found)
     reading = _reading(store, found, memory)
+    for path in reading.gone:
+        logger.warning("%s %s", path, GONE)
     if reading.current and recorded != store.sources():
         store.end(recorded, MADE_BY)  # the sources have moved, or have other names now
     return reading
@@ -129,7 +134,8 @@ def _reading(store: TileStore, found: Sequence[Source], memory: int) -> Reading:
     """What is to be read of sources, of a store that is there."""
     current = _is_current(store, found)
     as_before = {} if current else remembered(store, found, _recorded(store, found))
-    return Reading(store, found, memory, current=current, remembered=as_before)
+    gone = _absent(store, found)
+    return Reading(store, found, memory, current=current, remembered=as_before, gone=gone)
 
 
 def store_settings(settings: IngestSettings) -> StoreSettings:
@@ -177,15 +183,19 @@ def _there(url: str, wanted: StoreSettings, found: Sequence[Source]) -> TileStor
                 f"{url} has {name} {there!r}, asked for is {value!r}: "
                 "use the same setting, or another path for the new store"
             )
-    given = {source.path for source in found}
-    absent = sorted({s["path"] for s in _recorded(store, found)} - given)
-    forgotten = [path for path in absent if Path(path).exists()]
+    forgotten = [path for path in _absent(store, found) if Path(path).exists()]
     if forgotten:
         raise UsageError(
             f"{url} was also made from {', '.join(forgotten)}: give all sources of the map, move "
             "away what is no part of it any more, or give another path for the new store"
         )
     return store
+
+
+def _absent(store: TileStore, found: Sequence[Source]) -> list[str]:
+    """The sources that a store knows and that were not given."""
+    given = {source.path for source in found}
+    return sorted({s["path"] for s in _recorded(store, found)} - given)
 
 
 def require_some(found: Sequence[Source]) -> None:

@@ -34,6 +34,8 @@ from tilestream.store import Manifest, Share, Shares, TileStore, added
 
 MADE_BY = {stage.name: stage.version for stage in (scatter, merge)}
 """What a map is made by: another version makes it anew."""
+GONE = "is not there any more: what it gave is taken away from the map"
+"""What is said of a source that a map was made of."""
 Given = Mapping[int, Mapping[TileKey, Share]]
 """What a source gives to each tile, by the first point of each span of it."""
 
@@ -62,6 +64,7 @@ class Reading:
         *,
         current: bool = False,
         remembered: Mapping[str, Remembered] | None = None,
+        gone: Sequence[str] = (),
     ) -> None:
         """Sources, opened as far as their headers.
 
@@ -71,7 +74,9 @@ class Reading:
             memory: what a task may use [bytes].
             current: whether the store is whole and made from these sources: nothing is left to do.
             remembered: by path, the sources that have not changed since the store was made.
+            gone: sources that the map was made of and that are not there any more.
         """
+        self.gone = tuple(gone)
         self.store = store
         self.found = list(found)
         self.merges: tuple[Task, ...] = ()
@@ -115,8 +120,9 @@ class Reading:
 
     @property
     def notes(self) -> dict[str, list[str]]:
-        """What the headers of the sources tell, by source."""
-        return noticed({one.path: one.info.notes for one in self.found if one.info is not None})
+        """What the headers of the sources tell, by source, and which sources are gone."""
+        told = {one.path: one.info.notes for one in self.found if one.info is not None}
+        return noticed(told, {path: [GONE] for path in self.gone})
 
     @property
     def map_plan(self) -> MapPlan:

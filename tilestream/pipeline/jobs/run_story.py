@@ -1,12 +1,14 @@
 """The main job as it goes on: what is known after each part decides what the next one is."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import joblib
 
 from tilestream.files import Files
 from tilestream.model.shipped import SHIPPED
+from tilestream.notes import noticed
 from tilestream.pipeline.engine.attempt import Outcome, found
 from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.late_client import client_for
@@ -14,7 +16,7 @@ from tilestream.pipeline.engine.plan import Plan, paths_of
 from tilestream.pipeline.engine.stage import Task
 from tilestream.pipeline.jobs.estimator import LABELS, Estimator, estimator_of
 from tilestream.pipeline.jobs.inventory import announce, withdraw
-from tilestream.pipeline.jobs.map_reading import Reading
+from tilestream.pipeline.jobs.map_reading import GONE, Reading
 from tilestream.pipeline.jobs.map_update import Update
 from tilestream.pipeline.jobs.run_before import keep_before, update_of
 from tilestream.pipeline.jobs.run_book import Book
@@ -45,7 +47,9 @@ class Story:
         )
         found = self.reading.found if self.reading else None
         sources = self.store.sources() if found is None else [source.record for source in found]
-        self.inputs = with_logs(settings, inputs, sources)
+        logs = with_logs(settings, inputs, sources)
+        gone = {path: [GONE] for path in (self.reading.gone if self.reading else ())}
+        self.inputs = replace(logs, notes=noticed(logs.notes, gone))
         self.measure = Plan((), settings.memory)
         self.estimator = Estimator()
         """What makes the estimates, as far as it is known by now."""
