@@ -134,7 +134,7 @@ def _reading(store: TileStore, found: Sequence[Source], memory: int) -> Reading:
     """What is to be read of sources, of a store that is there."""
     current = _is_current(store, found)
     as_before = {} if current else remembered(store, found, _recorded(store, found))
-    gone = _absent(store, found)
+    gone = _gone(store, found)
     return Reading(store, found, memory, current=current, remembered=as_before, gone=gone)
 
 
@@ -196,6 +196,13 @@ def _absent(store: TileStore, found: Sequence[Source]) -> list[str]:
     """The sources that a store knows and that were not given."""
     given = {source.path for source in found}
     return sorted({s["path"] for s in _recorded(store, found)} - given)
+
+
+def _gone(store: TileStore, found: Sequence[Source]) -> list[str]:
+    """The sources of a store that were not given, by any name that they may have now."""
+    known = {record["path"]: record["state"] for record in _recorded(store, found)}
+    renamed = {source.state for source in found if source.path not in known}
+    return [path for path in _absent(store, found) if known[path] not in renamed]
 
 
 def require_some(found: Sequence[Source]) -> None:
