@@ -20,7 +20,8 @@ from tornado.websocket import WebSocketClientConnection, websocket_connect
 FLAGS = (
     "--headless=new",
     "--no-sandbox",
-    "--disable-gpu",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
     "--disable-dev-shm-usage",
     "--disable-background-networking",
     "--no-first-run",

@@ -399,7 +399,7 @@ def test_neither_order_nor_repetition_changes_a_byte(
     content = write_report(shuffled, tmp_path, threshold=LIMIT)
     assert strict_json(tmp_path / "report.json") == content
     names = [p.relative_to(folder) for p in folder.rglob("*") if p.is_file()]
-    assert len(names) == len(FILES) + 16
+    assert len(names) == len(FILES) + 21
     for name in names:
         assert (folder / name).read_bytes() == (tmp_path / name).read_bytes(), name
 

@@ -41,6 +41,7 @@ from tilestream.report.page import report_page
 from tilestream.report.relief import relief_png
 from tilestream.report.segments import worst_places
 from tilestream.report.summary import AXES, STARTS, summary
+from tilestream.report.views import View
 
 TAGS = re.compile(r"<(script|style)[^>]*>.*?</\1>|<[^>]*>", re.DOTALL)
 
@@ -66,13 +67,14 @@ def text_of(page: Path | Findings, section: str) -> str:
     """What a person reads in a section of a page, or of the page that findings give."""
     source = page.read_text(encoding="utf-8") if isinstance(page, Path) else rendered(page)
     (inner,) = re.findall(rf'<section id="{section}">(.*?)</section>', source, re.DOTALL)
+    inner = re.sub(r"<details.*?</details>", "", inner, flags=re.DOTALL)
     return " ".join(html.unescape(TAGS.sub(" ", inner)).replace("\u202f", " ").split())
 
 
 def rendered(found: Findings) -> str:
     """The page alone, without pictures of the worst places."""
     content = summary(found, LIMIT)
-    return report_page(found, content, dict.fromkeys(range(1, 11), "not taken"), "not drawn")
+    return report_page(found, content, [View("not taken")] * 10, ["not drawn"] * 6)
 
 
 @pytest.mark.parametrize("name", ["whole", "without_labels", "one_place", "nothing_estimated"])
@@ -243,7 +245,7 @@ def test_the_worst_places_are_told_in_words_and_pictures(found: Findings, page: 
         start = f"{number} {place['route_id']} , {place['arc_length']:.0f} m along"
         assert start in text
         assert cm(place["estimate"]).replace("\u00a0", " ") in text
-    assert page.read_text().count('src="data:image/png;base64,') == 10 + 1  # the ends
+    assert page.read_text().count('src="data:image/png;base64,') == 10 + 6  # the ends
 
 
 def test_table_iv_stands_beside_the_papers_and_names_the_leak(page: Path) -> None:
@@ -419,7 +421,8 @@ def test_markup_is_in_the_templates_alone() -> None:
 def test_the_page_asks_for_nothing_from_outside(page: Path) -> None:
     source = page.read_text(encoding="utf-8")
     own = re.sub(r"<script>.*?</script>", "", source, flags=re.DOTALL)
-    assert not re.findall(r'(?:src|href)="(?!data:|#)[^"]*"', own)
+    beside = set(re.findall(r'(?:src|href)="(?!data:|#)([^"]*)"', own))
+    assert beside == {path.name for path in page.parent.iterdir() if path.is_file()} - {page.name}
     assert "url(" not in own
     assert "@import" not in own
 

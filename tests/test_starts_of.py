@@ -129,8 +129,8 @@ def test_the_command_tells_each_start(tables: Path, capsys: pytest.CaptureFixtur
 def test_a_picture_shows_every_start_and_every_end() -> None:
     rows = ends_of("morning", 3)
     far = rows.assign(along=np.where(rows["along"] > 1.0, 7.0, rows["along"]))
-    figure = ends_figure([("one", rows), ("far", far)])
-    above, below = np.array(figure.axes[:4]).reshape(2, 2)
+    figures = [ends_figure("one", rows), ends_figure("far", far)]
+    above, below = zip(*(figure.axes[:2] for figure in figures), strict=True)
     fail = rows["error"].to_numpy() > 0.5
     for axes in above:
         (squares,) = (c for c in axes.collections if isinstance(c, PatchCollection))
@@ -157,7 +157,9 @@ def test_a_picture_shows_every_start_and_every_end() -> None:
 def test_the_worst_measured_places_are_drawn_and_lie_apart(tmp_path: Path) -> None:
     found = whole()
     content = write_report(found, tmp_path)
-    assert "ends.png" in content["figures"]
+    assert [name for name in content["figures"] if name.startswith("ends")] == [
+        f"ends_{number:02d}.png" for number in range(1, MEASURED + 1)
+    ]
     rows = worst_measured(found.labels)
     chosen = found.labels.iloc[rows]
     assert len(rows) == MEASURED

@@ -13,6 +13,7 @@ from bokeh.models import (
     HoverTool,
     NumeralTickFormatter,
 )
+from bokeh.models.annotations.geometry import Span
 from bokeh.models.renderers import GlyphRenderer
 from bokeh.plotting import figure
 
@@ -21,6 +22,7 @@ from tilestream.report.colours import (
     AGAIN,
     CHOICES,
     HELD_OUT,
+    HERE,
 )
 from tilestream.report.comparison import Comparison
 from tilestream.report.data import Findings, estimates
@@ -79,7 +81,7 @@ def profile_chart(found: Findings, route_id: str, target: str) -> dict[str, Any]
     frame].
     """
     plot = _new_road(270, "error [cm]")
-    plot.name = "profile"  # by which the page finds it
+    plot.name, plot.tags = "profile", [route_id]  # by which the page finds it
     rows = found.places[found.places["route_id"].astype(str) == route_id]
     estimate, measured = estimates(rows), measure_of(rows).measured
     every = points_per_mark(len(rows), MOST_POINTS)
@@ -110,6 +112,8 @@ def profile_chart(found: Findings, route_id: str, target: str) -> dict[str, Any]
             "legend_label": "measured",
         }
         plot.scatter("arc", "error", source=ColumnDataSource(squares, name="measured"), **style)
+    here: dict[str, Any] = {"line_color": HERE, "line_width": 2, "line_dash": "dashed"}
+    plot.add_layout(Span(dimension="height", name="here", visible=False, location=0.0, **here))
     plot.add_tools(hover(line, PATH_TIP, mode="vline"))
     finish(plot)
     return item(plot, target)

@@ -5,7 +5,13 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from bokeh.models import ColumnDataSource, FixedTicker, LinearColorMapper
+from bokeh.models import (
+    BooleanFilter,
+    CDSView,
+    ColumnDataSource,
+    FixedTicker,
+    LinearColorMapper,
+)
 from bokeh.models.annotations.labels import Label
 from bokeh.models.annotations.legends import ColorBar, ScaleBar
 from bokeh.plotting import figure
@@ -14,7 +20,7 @@ from numpy.typing import NDArray
 from tilestream.from_above import FromAbove
 from tilestream.records import Float64, Int64
 from tilestream.report.charts import finish, hover, item, new_plot
-from tilestream.report.colours import MISSING, Scale
+from tilestream.report.colours import HERE, MISSING, Scale
 from tilestream.report.data import Findings, estimates, like_training
 from tilestream.report.formatting import CM_PER_M, cm, cm_about, cm_by_name, cm_span, percent
 from tilestream.report.lines import points_per_mark, worst_of_every
@@ -39,8 +45,6 @@ NUMBER: dict[str, Any] = {
     "padding": 4,
 }
 """How the number of one of the worst places looks."""
-HERE = "#d55e00"
-"""Of the ring round the place that the page's address names."""
 SCALE_BAR: dict[str, Any] = {
     "unit": "m",
     "location": "bottom_left",
@@ -94,7 +98,8 @@ def city_map(found: Findings, tip: str) -> dict[str, Any]:
             if kind == "missing"
             else {"color": {"field": "step", "transform": mapper}, "size": "size"}
         )
-        glyphs = plot.scatter("x", "y", source=source, marker=marker, legend_label=name, **style)
+        style |= {"marker": marker, "legend_label": name, "view": _choosable()}
+        glyphs = plot.scatter("x", "y", source=source, **style)
         # of the dots under the mouse the worst, which is the one on top
         plot.add_tools(hover(glyphs, tip, sort_by=[("estimate", -1)]))
     _draw_measured(plot, found, origin, (tip, mapper))
@@ -109,6 +114,7 @@ def city_map(found: Findings, tip: str) -> dict[str, Any]:
         for axis, value in zip("xy", origin, strict=True)
     )
     finish(plot)
+    plot.legend.ncols = 2  # so that it fits a phone
     return item(plot, "city-map")
 
 
@@ -130,6 +136,11 @@ def _draw_map(plot: figure, above: FromAbove | None, origin: Float64) -> None:
         anchor="bottom_left",
         level="underlay",
     )
+
+
+def _choosable() -> CDSView:
+    """All places, until the page's search chooses some."""
+    return CDSView(filter=BooleanFilter(booleans=None))
 
 
 def _colour_bar(scale: Scale, mapper: LinearColorMapper) -> ColorBar:
@@ -211,6 +222,7 @@ def _draw_measured(plot: figure, found: Findings, origin: Float64, how: tuple[st
     source = ColumnDataSource(columns, name="measured")
     style: dict[str, Any] = {"fill_color": {"field": "step", "transform": mapper}}
     style |= {"marker": "square", "size": 9, "line_color": "black", "legend_label": "measured"}
+    style["view"] = _choosable()
     glyphs = plot.scatter("x", "y", source=source, **style)
     plot.add_tools(hover(glyphs, tip, sort_by=[("measured", -1)]))
 

@@ -31,6 +31,9 @@ Ends = Callable[[str, int], pd.DataFrame]
 Around = Callable[[float, float, float], Float64]
 """(n, 3) map points [m] within about `AROUND` of a place in the map frame."""
 
+Seen = Callable[[Float64, float], Float64]
+"""(k, 3) what the lidar sees [m, map frame] from a place (3,) [m] with a heading [rad]."""
+
 
 def _none() -> pd.DataFrame:
     return pd.DataFrame()
@@ -98,6 +101,9 @@ class Findings:
     pictures."""
     around: Around | None = None
     """The map round a place, for the pictures of the worst ones; None: no pictures."""
+
+    seen: Seen | None = None
+    """What the virtual lidar sees at a place, for the same pictures; None: it did not look."""
 
     @property
     def scale(self) -> Scale:

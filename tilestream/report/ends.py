@@ -1,7 +1,5 @@
 """Pictures of where registrations end that start round a place: the paper's Fig. 11."""
 
-from collections.abc import Sequence
-
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
@@ -15,8 +13,6 @@ from tilestream.records import Float64
 from tilestream.report.colours import ACTUAL, FIXED, to_rgb
 from tilestream.report.formatting import CM_PER_M
 
-IN_A_ROW = 3
-"""Places beside each other."""
 FARTHEST = 3.0
 """How far from the true position an end is drawn at most [m]; those beyond are counted."""
 NEAREST = 0.6
@@ -27,36 +23,26 @@ REPEATED = 1e-6
 """Starts this near are at one place [m]: they differ in yaw or z."""
 
 
-def ends_figure(places: Sequence[tuple[str, pd.DataFrame]]) -> Figure:
-    """Where the starts of places were and where they ended, `IN_A_ROW` places beside each other.
+def ends_figure(title: str, starts: pd.DataFrame) -> Figure:
+    """Where the starts of a place were and where they ended.
 
     Above, each start as a square of the lattice of starts, coloured by the error that it ends with;
     below, where it ended. Starts that fail are black. Along the true heading is to the right, left
     of it up; the cross is the true position, the dashed circle an error of 0.5 m.
 
     Args:
-        places: what to call each place, and its starts (`starts_of`).
+        title: what to call the place.
+        starts: its starts (`starts_of`).
     """
-    wide = min(len(places), IN_A_ROW)
-    rows = -(-len(places) // wide)
-    figure = Figure(figsize=(2.6 * wide + 0.9, 5.6 * rows), layout="constrained")
-    panels = figure.subplots(2 * rows, wide, squeeze=False)
-    for number in range(rows * wide):
-        row, column = divmod(number, wide)
-        above, below = panels[2 * row : 2 * row + 2, column]
-        if number >= len(places):
-            above.remove()
-            below.remove()
-            continue
-        title, starts = places[number]
-        _draw_starts(above, starts)
-        _draw_ends(below, starts)
-        above.set_title(title, fontsize=9, parse_math=False)
-        below.set_xlabel("along [m]", fontsize=8)
-        if column == 0:
-            above.set_ylabel("starts, across [m]", fontsize=8)
-            below.set_ylabel("ends, across [m]", fontsize=8)
-    _colour_bar(figure, panels[0, -1])
+    figure = Figure(figsize=(3.5, 5.6), layout="constrained")
+    above, below = figure.subplots(2, 1)
+    _draw_starts(above, starts)
+    _draw_ends(below, starts)
+    above.set_title(title, fontsize=9, parse_math=False)
+    above.set_ylabel("starts, across [m]", fontsize=8)
+    below.set_ylabel("ends, across [m]", fontsize=8)
+    below.set_xlabel("along [m]", fontsize=8)
+    _colour_bar(figure, above)
     return figure
 
 

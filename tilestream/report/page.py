@@ -16,13 +16,16 @@ from tilestream.errors import alike
 from tilestream.notes import shared
 from tilestream.report import charts, evaluation, formatting
 from tilestream.report.city_map import city_map, map_shows_every
+from tilestream.report.clouds import packed, viewer
 from tilestream.report.colours import ACTUAL, CRITERION, HELD_OUT, OTHER
+from tilestream.report.columns import COLUMNS
 from tilestream.report.comparison import QUANTILE, Comparison
 from tilestream.report.data import AROUND, Findings
 from tilestream.report.drives import EVALUATED
 from tilestream.report.pictures import ABOVE, BELOW, heights_ramp
 from tilestream.report.segments import APART, BRIDGE
 from tilestream.report.summary import AXES, STARTS, cards, digits_of
+from tilestream.report.views import View
 
 MOST_ROUTES = 40
 """Routes that the page lists, the worst by their 95 % quantile; `report.json` has all."""
@@ -34,6 +37,21 @@ MOST_CHARTS = 24
 """Labelled paths, or compared routes, that have a chart."""
 MOST_TILES = 60
 """Tiles that the page lists of each vehicle; `compare.json` has all."""
+
+
+FILES = {
+    "places.csv": "all places with their estimates and factors, for a spreadsheet",
+    "places.parquet": "the same as GeoParquet, for Python and GIS",
+    "over_threshold.geojson": "stretches over the threshold, for a web map or GIS",
+    "map.pcd": "the places coloured by error, for a viewer of point clouds",
+    "report.json": "all figures of this page, for machines",
+}
+"""What lies beside the report."""
+COMPARE_FILES = {
+    "compare.csv": "all places with the estimate of each choice",
+    "compare.json": "all figures of this page, for machines",
+}
+"""What lies beside a comparison."""
 
 
 def _environment() -> Environment:
@@ -55,7 +73,9 @@ def _environment() -> Environment:
     environment.filters |= {function.__name__: function for function in filters}
     environment.filters["alike"] = alike
     environment.filters["base64"] = lambda data: base64.b64encode(data).decode("ascii")
+    environment.filters["explained"] = COLUMNS.__getitem__
     environment.tests["known"] = formatting.known
+    environment.tests["explained"] = COLUMNS.__contains__
     environment.globals |= {"cm_span": formatting.cm_span, "evaluation": evaluation}
     environment.globals |= {"CRITERION": CRITERION, "OTHER": OTHER}
     environment.globals |= {"ACTUAL": ACTUAL, "HELD_OUT": HELD_OUT}
@@ -68,25 +88,30 @@ _ENVIRONMENT = _environment()
 def report_page(
     found: Findings,
     content: Mapping[str, Any],
-    pictures: Mapping[int, bytes | str],
-    ends: bytes | str,
+    views: Sequence[View],
+    ends: Sequence[bytes | str],
 ) -> str:
     """The page of a run as HTML.
 
     Args:
         found: what is reported.
         content: its `summary`.
-        pictures: PNG of each of the worst places by number, or why there is none.
-        ends: PNG of where the starts of the worst measured places ended, or why there is none.
+        views: what is shown of each of the worst places.
+        ends: PNG of where the starts of each of the worst measured places ended, or why there is
+            none.
     """
     paths = content["paths"][:MOST_CHARTS]
     segments = sorted(content["segments"], key=lambda s: (-s["worst"], s["route_id"], s["begin"]))
     profiles = [route for route in _worst_first(content["routes"]) if route["p95"] is not None]
     profiles = profiles[:MOST_PROFILES]
     tip = _ENVIRONMENT.get_template("map_tip.html.j2").render()
+    turning = any(view.cloud for view in views)
     return _render(
         "report.html.j2",
         content,
+        ("page.js", "cloud.js", "place.js", "choose.js"),
+        [viewer()] if turning else [],
+        FILES,
         [city_map(found, tip)]
         + [
             charts.profile_chart(found, route["route_id"], f"along-{k}")
@@ -100,7 +125,10 @@ def report_page(
         paths=paths,
         profiles=profiles,
         absent=_absent(content, ends),
-        pictures=pictures,
+        views=views,
+        viewer=packed(viewer()) if turning else "",
+        entered=_entered(content["worst"]),
+        unseen=sorted({view.unseen for view in views} - {""}),
         ends=ends,
         shown_every=map_shows_every(found),
         own_range=found.own_range,
@@ -111,7 +139,16 @@ def report_page(
     )
 
 
-def _absent(content: Mapping[str, Any], ends: bytes | str) -> dict[str, str]:
+def _entered(worst: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Where the worst places are, by number, as the addresses of the page name them."""
+    return [
+        {"number": number, "x": round(place["x"], 1), "y": round(place["y"], 1)}
+        for number, place in enumerate(worst, start=1)
+        if formatting.known(place["x"]) and formatting.known(place["y"])
+    ]
+
+
+def _absent(content: Mapping[str, Any], ends: Sequence[bytes | str]) -> dict[str, str]:
     """Why sections of a run's page have nothing to say, by section: they are left out."""
     labelled = content["headline"]["labelled"]
     judged = (
@@ -121,10 +158,11 @@ def _absent(content: Mapping[str, Any], ends: bytes | str) -> dict[str, str]:
         else "there were no labels, so nothing can be judged: the estimates rest on the model"
     )
     unlabelled = "no place was labelled: without a log of scans there is no measured error"
+    missing = [end for end in ends if isinstance(end, str)]
     why = {
         "along": (content["headline"]["estimated"], "no place has an estimate"),
         "paths": (content["paths"], unlabelled),
-        "ends": (isinstance(ends, bytes), str(ends)),
+        "ends": (len(missing) < len(ends), [*missing, unlabelled][0]),
         "table-i": (content["table_i"], unlabelled),
         "table-iii": (content["table_iii"], unlabelled),
         "importances": (content["importances"], "nothing was trained in this run"),
@@ -149,6 +187,9 @@ def comparison_page(found: Comparison, content: Mapping[str, Any]) -> str:
     return _render(
         "comparison.html.j2",
         content,
+        ("page.js",),
+        [],
+        COMPARE_FILES,
         [charts.route_chart(found, name, f"route-{k}") for k, name in enumerate(routes)],
         routes=routes,
         absent={},
@@ -160,18 +201,38 @@ def comparison_page(found: Comparison, content: Mapping[str, Any]) -> str:
 
 
 def _render(
-    template: str, content: Mapping[str, Any], items: Sequence[Mapping[str, Any]], **more: Any
+    template: str,
+    content: Mapping[str, Any],
+    ours: Sequence[str],
+    later: Sequence[str],
+    files: Mapping[str, str],
+    items: Sequence[Mapping[str, Any]],
+    **more: Any,
 ) -> str:
+    """A page of these templates of scripts and these charts; what else the template asks for is
+    `more`.
+
+    Args:
+        template: its name.
+        content: what is told.
+        ours: scripts of ours, the first one first.
+        later: scripts that these may begin.
+        files: what lies beside the page, by name.
+        items: its charts.
+        more: what else the template asks for.
+    """
     # BokehJS without widgets, tables and what needs a server
     bokeh = Resources(mode="inline", components=["bokeh"]).js_raw[0]
-    scripts = [bokeh, _ENVIRONMENT.get_template("page.js").render()]
+    own = "\n".join(_ENVIRONMENT.get_template(name).render() for name in ours)
+    scripts = [bokeh, own]
     return _ENVIRONMENT.get_template(template).render(
         content=content,
         noticed=shared(content["notes"]),
         evaluated_share=EVALUATED,
         charts=items,
         scripts=[Markup(script) for script in scripts],
-        policy=_policy(scripts),
+        policy=_policy([*scripts, *later]),
+        files=files.items(),
         limit=formatting.cm(content["threshold"], 0),
         **more,
     )
@@ -180,13 +241,14 @@ def _render(
 def _policy(scripts: Sequence[str]) -> str:
     """The Content-Security-Policy of a page: it runs these scripts and asks nobody for anything.
 
-    Styles are allowed as they are: BokehJS and our bars make them.
+    Styles are allowed as they are: BokehJS and our bars make them. K3D has fonts inside, and makes
+    a worker.
     """
     digests = (hashlib.sha256(script.encode("utf-8")).digest() for script in scripts)
     allowed = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)
     return (
         f"default-src 'none'; script-src {allowed}; style-src 'unsafe-inline'; "
-        "img-src data:; base-uri 'none'; form-action 'none'"
+        "img-src data: blob:; font-src data:; worker-src blob:; base-uri 'none'; form-action 'none'"
     )
 
 

@@ -21,6 +21,7 @@ from tilestream.report.colours import (
     HELD_OUT,
     MISSING,
     OTHER,
+    SEEN,
 )
 from tilestream.report.data import AROUND, Findings, estimates
 from tilestream.report.formatting import CM_PER_M
@@ -47,13 +48,15 @@ def png(figure: Figure, dpi: int = 110) -> bytes:
     return buffer.getvalue()
 
 
-def surroundings(points: Float64, place: Float64, heading: float) -> Figure:
-    """The map round a place from above, coloured by height, north (map y) up.
+def surroundings(points: Float64, place: Float64, heading: float, seen: Float64) -> Figure:
+    """The map round a place from above, coloured by height, north (map y) up, and on it what the
+    lidar sees.
 
     Args:
         points: (n, 3) map points [m].
         place: (3,) the place of the lidar [m].
         heading: of travel there [rad].
+        seen: (k, 3) returns of a virtual scan [m]; none: it was not taken.
     """
     height = _seen_from_above(points - place)
     figure = Figure(figsize=(3.0, 3.0))
@@ -68,6 +71,8 @@ def surroundings(points: Float64, place: Float64, heading: float) -> Figure:
         vmax=ABOVE,
         interpolation="nearest",
     )
+    x, y = (seen - place)[:, :2].T
+    axes.scatter(x, y, s=0.5, color=SEEN, linewidths=0)
     step = 11.0 * np.array([np.cos(heading), np.sin(heading)])
     arrow = {"arrowstyle": "-|>", "color": "#ff5a36", "lw": 2.2, "mutation_scale": 16}
     axes.annotate("", xy=(step[0], step[1]), xytext=(0.0, 0.0), arrowprops=arrow)

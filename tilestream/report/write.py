@@ -2,17 +2,15 @@
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from tilestream.errors import TilestreamError
 from tilestream.files import Files
 from tilestream.report import pictures
 from tilestream.report.comparison import Comparison
 from tilestream.report.data import Findings, estimates
-from tilestream.report.ends import ends_figure
 from tilestream.report.exports import (
     write_cloud,
     write_csv,
@@ -21,16 +19,16 @@ from tilestream.report.exports import (
     write_json,
     write_text,
 )
-from tilestream.report.formatting import cm, known
 from tilestream.report.page import comparison_page, report_page
 from tilestream.report.segments import check_threshold
 from tilestream.report.summary import plain, summary
+from tilestream.report.views import View, ends_of, view_of
 
 THRESHOLD = 0.25
 """Estimates above this are too large [m]: the paper's, and where Autoware warns."""
 
 
-OURS = re.compile(r"(map|distribution|paths|importances|coverage|ends|worst_\d+)\.png")
+OURS = re.compile(r"(map|distribution|paths|importances|coverage|ends(_\d+)?|worst_\d+)\.png")
 """What we call our figures: others of the folder are somebody else's."""
 
 
@@ -63,8 +61,8 @@ def write_report(
     write_geojson(place.under("over_threshold.geojson"), findings, threshold)
     write_csv(place.under("places.csv"), findings.places)
     content["not_in_cloud"] = write_cloud(place.under("map.pcd"), findings)
-    worst = {n: _picture(findings, at) for n, at in enumerate(content["worst"], start=1)}
-    ends = _ends(findings, content["worst_measured"])
+    worst = [view_of(findings, place) for place in content["worst"]]
+    ends = ends_of(findings, content["worst_measured"])
     content["figures"] = _write_figures(place.under("figures"), findings, worst, ends)
     write_text(place.under("index.html"), report_page(findings, content, worst, ends))
     write_json(place.under("report.json"), content)
@@ -97,44 +95,11 @@ def write_comparison(
     return content
 
 
-def _picture(findings: Findings, worst: Mapping[str, Any]) -> bytes | str:
-    """The surroundings of one of the worst places as PNG, or why there is no picture."""
-    if findings.around is None:
-        return "the report was made without the map"
-    if not all(known(worst[name]) for name in ("x", "y", "z", "heading")):
-        return "the place has no position"
-    x, y, z = float(worst["x"]), float(worst["y"]), float(worst["z"])
-    try:
-        points = findings.around(x, y, z)
-    except TilestreamError as error:
-        return str(error)
-    if not len(points):
-        return "no map points around it"
-    return pictures.png(pictures.surroundings(points, np.array([x, y, z]), worst["heading"]))
-
-
-def _ends(findings: Findings, worst: Sequence[Mapping[str, Any]]) -> bytes | str:
-    """Where the starts of the worst measured places ended as PNG, or why there is no picture."""
-    if not worst:
-        return "no place was labelled"
-    if findings.ends is None:
-        return "the report was made without the tables of starts"
-    drawn = []
-    for place in worst:
-        try:
-            rows = findings.ends(place["group"], place["sample"])
-        except TilestreamError as error:
-            return str(error)
-        title = f"{place['path']}, {place['arc_length']:.0f} m\n{cm(place['error_mean'])}"
-        drawn.append((title, rows))
-    return pictures.png(ends_figure(drawn))
-
-
 def _write_figures(
     folder: Files,
     findings: Findings,
-    worst: Mapping[int, bytes | str],
-    ends: bytes | str,
+    worst: Sequence[View],
+    ends: Sequence[bytes | str],
 ) -> list[str]:
     """Write what there is to draw; the names of the files."""
     drawn = {"map.png": pictures.map_figure(findings)}
@@ -147,8 +112,10 @@ def _write_figures(
     if len(findings.coverage):
         drawn["coverage.png"] = pictures.coverage_figure(findings.coverage)
     files = {name: pictures.png(figure) for name, figure in drawn.items()}
-    files |= {f"worst_{n:02d}.png": data for n, data in worst.items() if isinstance(data, bytes)}
-    files |= {"ends.png": ends} if isinstance(ends, bytes) else {}
+    of_places = {"worst": [view.picture for view in worst], "ends": ends}
+    for what, pngs in of_places.items():
+        named = {f"{what}_{n:02d}.png": data for n, data in enumerate(pngs, start=1)}
+        files |= {name: data for name, data in named.items() if isinstance(data, bytes)}
     for name, data in files.items():
         folder.under(name).write(data)
     for old in folder.names():

@@ -10,6 +10,7 @@ import pandas as pd
 from tilestream.errors import ModelError
 from tilestream.factors.along_route import WIDTH
 from tilestream.factors.heights import note_of_drive, notes_of_routes
+from tilestream.factors.scan_at import scan_at
 from tilestream.from_above import FromAbove, seen_from_above
 from tilestream.grid import MM_PER_M, Box
 from tilestream.model.dataset import POINTS_MIN, TARGETS, Dataset, nearest_along
@@ -33,7 +34,7 @@ from tilestream.pipeline.jobs.run_worth import worth_of
 from tilestream.pipeline.stages.evaluate import by_protocol
 from tilestream.pipeline.stages.samples import places_with_factors
 from tilestream.records import Float64
-from tilestream.report.data import AROUND, BESIDE, Findings
+from tilestream.report.data import AROUND, BESIDE, Findings, Seen
 from tilestream.report.measured import with_measured
 from tilestream.report.worth import Worth
 from tilestream.store import TileStore
@@ -283,6 +284,7 @@ def findings_of(
         crs=store.settings.crs,
         worth=worth,
         around=lambda x, y, _: points_around(store, x, y, AROUND),
+        seen=_seen(done, store),
         above=_above(done, store, places),
     )
     evaluation = {name: table.to_dict("records") for name, table in tables.items()}
@@ -296,6 +298,15 @@ def _above(done: Done, store: TileStore, places: pd.DataFrame) -> FromAbove | No
     if not len(at) or not tiles:
         return None
     return seen_from_above(store, tiles, Box.around(at, BESIDE), MOST_PIXELS)
+
+
+def _seen(done: Done, store: TileStore) -> Seen | None:
+    """What the virtual lidar sees at a place; None: it has looked from none."""
+    looked = done.outputs("observe")
+    if not looked:
+        return None
+    by = looked[0].takes["observing"]
+    return lambda at, heading: scan_at(store, at, heading, by.sensor, by.seeing, AROUND)
 
 
 def _worth(

@@ -1,4 +1,20 @@
 "use strict";
+const ready = []; // what begins as soon as the charts are drawn
+
+function rootNamed(name) {
+  return Bokeh.documents.flatMap((doc) => doc.roots()).find((root) => root.name === name);
+}
+
+// Shows so much of a map round a point, and at least the streets beside it; axes stay equal.
+function frame(map, x, y, width, height) {
+  const ratio = map.inner_width / map.inner_height || 1;
+  const high = Math.max(0.6 * height, (0.6 * width) / ratio, 50);
+  for (const [range, middle, half] of [[map.x_range, x, high * ratio], [map.y_range, y, high]]) {
+    range.have_updated_interactively = true; // as if by the mouse: data no longer move it
+    range.setv({ start: middle - half, end: middle + half });
+  }
+}
+
 (() => {
   const dark = window.matchMedia("(prefers-color-scheme: dark)");
   const printing = window.matchMedia("print");
@@ -31,48 +47,6 @@
     }
   }
 
-  // Shows the place that the address names, `#x=…&y=…` in the map's frame: a link to it can be sent.
-  function go() {
-    const at = new URLSearchParams(location.hash.slice(1));
-    const map = Bokeh.documents.flatMap((doc) => doc.roots()).find((root) => root.name === "city-map");
-    if (!map || !at.has("x") || !at.has("y")) {
-      return;
-    }
-    const [x, y] = [Number(at.get("x")) - map.tags[0], Number(at.get("y")) - map.tags[1]];
-    if (!Number.isFinite(x) || !Number.isFinite(y)) {
-      return;
-    }
-    const high = 50;
-    const wide = high * (map.inner_width / map.inner_height || 1);
-    for (const [range, middle, half] of [[map.x_range, x, wide], [map.y_range, y, high]]) {
-      range.have_updated_interactively = true; // as if by the mouse: data no longer move it
-      range.setv({ start: middle - half, end: middle + half });
-    }
-    for (const model of map.references()) {
-      if (model.name === "here") {
-        model.data = { x: [x], y: [y] };
-      }
-    }
-    document.getElementById("map").scrollIntoView();
-  }
-
-  // A click into a profile names the nearest place of it.
-  function listen(profile) {
-    const places = [...profile.references()].find((model) => model.name === "profile" && model.data);
-    profile.on_event("tap", (event) => {
-      const { arc, x, y } = places.data;
-      let nearest = -1;
-      for (let k = 0; k < arc.length; k++) {
-        if (Number.isFinite(x[k]) && !(Math.abs(arc[k] - event.x) >= Math.abs(arc[nearest] - event.x))) {
-          nearest = k;
-        }
-      }
-      if (nearest >= 0) {
-        location.hash = `x=${x[nearest].toFixed(1)}&y=${y[nearest].toFixed(1)}`;
-      }
-    });
-  }
-
   Bokeh.set_log_level("warn");
   const items = [...document.querySelectorAll("script.chart-data")].map((s) => JSON.parse(s.textContent));
   Promise.all(items.map((item) => Bokeh.embed.embed_item(item))).then(() => {
@@ -80,13 +54,7 @@
     dark.addEventListener("change", paint);
     window.addEventListener("beforeprint", paint);
     window.addEventListener("afterprint", paint);
-    for (const root of Bokeh.documents.flatMap((doc) => doc.roots())) {
-      if (root.name === "profile") {
-        listen(root);
-      }
-    }
-    window.addEventListener("hashchange", go);
-    go();
+    ready.forEach((begin) => begin());
     document.documentElement.dataset.charts = String(items.length);
   });
 })();
