@@ -12,6 +12,7 @@ import pytest
 from hand_made import listed
 from hypothesis import given
 from hypothesis import strategies as st
+from map_diffs import words
 from scenes import scene
 
 import tilestream as ts
@@ -24,6 +25,7 @@ from tilestream.formats.points.pcd import write_pcd
 from tilestream.marks import Mark
 from tilestream.model.phrases import NO_POLES, SLIDES_ALONG
 from tilestream.model.training import PREDICTION_COLUMNS
+from tilestream.report import write_diff
 from tilestream.tables import write_table
 
 
@@ -169,6 +171,30 @@ def test_the_command_tells_people_and_machines(
     assert "got worse" in capsys.readouterr().out
 
 
+def test_the_command_closes_the_gate_and_writes_the_page(
+    two: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old, new = two
+    line = ["diff", str(old), str(new), "--report", str(tmp_path / "page")]
+    assert run([*line, "--fail-worse", "0.1", "--json"]) == 1
+    said = capsys.readouterr()
+    told = json.loads(said.out)
+    assert told == json.loads((tmp_path / "page" / "diff.json").read_text())
+    assert told["gate"]["passed"] is False
+    assert (told["gate"]["fail_worse"], told["gate"]["over"]) == (0.1, "places")
+    assert "0.2 m on r at 3 m" in said.err
+    assert "The gate is closed" in words(tmp_path / "page" / "diff.html")
+
+    assert run([*line, "--fail-worse", "0.25"]) == 0
+    assert run(["diff", str(old), str(old), "--fail-worse", "0.25"]) == 0
+    assert "the gate is open" in capsys.readouterr().err
+    assert run(["diff", str(old / "map.zarr"), str(new / "map.zarr"), "--fail-worse", "9"]) == 1
+    assert "no place is compared" in capsys.readouterr().err
+    assert run(["diff", str(old), str(new), "--report", str(tmp_path / "other"), "--quiet"]) == 0
+    assert json.loads((tmp_path / "other" / "diff.json").read_text())["gate"] is None
+    assert "gate" not in words(tmp_path / "other" / "diff.html")
+
+
 # --- Where the maps are
 
 
@@ -227,6 +253,33 @@ def test_the_map_of_a_run_is_found_wherever_they_went(runs: Path, tmp_path: Path
     runs.rename(tmp_path / "renamed")  # a project as a whole
     there = tmp_path / "renamed" / "runs" / "new"
     assert compared(there, there)[2:] == (usual[2] + len(usual[0]) + len(usual[1]), 3, {})
+
+
+def test_a_page_knows_what_both_runs_are_and_sees_the_newer_map(
+    runs: Path, two: tuple[Path, Path], tmp_path: Path
+) -> None:
+    old, new = runs / "runs" / "old", runs / "runs" / "new"
+    found = diff(old, new)
+    before, after = (side.facts for side in found.sides)
+    assert [side.name for side in found.sides] == [str(old), str(new)]
+    assert before["map"] == str(runs / "maps" / "old.zarr")
+    store = ts.open_store(after["map"])
+    assert before["tiles"] < after["tiles"] == len(store.identities())
+    assert (after["sensor"], after["CRS"]) == ("VLP16", "none: a local frame")
+    assert after["sample points"] == after["with an estimate"] == 3
+    assert after["run began"] == json.loads((new / "run.json").read_text())["began"]
+    above = found.above()
+    assert above is not None
+    highest = max(store.tile(key).points()[:, 2].max() for key in found.changed)
+    assert np.nanmax(above.height) >= highest - 0.001
+    write_diff(found, tmp_path)
+    assert "data:image/png;base64," in (tmp_path / "diff.html").read_text()
+    assert diff(*two).above() is None, "nobody has made pictures of these tiles"
+    was = found.sides[0].facts
+    shutil.rmtree(runs / "maps" / "old.zarr")
+    gone = diff(old, new).sides[0].facts
+    assert dict(gone) == {name: was[name] for name in gone}
+    assert "tiles" not in gone
 
 
 def test_tables_that_moved_are_of_the_map_that_they_were_made_on(runs: Path) -> None:

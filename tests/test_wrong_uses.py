@@ -13,6 +13,7 @@ import tilestream as ts
 from tilestream.cli import run
 from tilestream.cli.app import COMMANDS
 from tilestream.errors import TilestreamError
+from tilestream.report import write_diff
 
 LONG = "a" * 300
 """A name that no disk takes."""
@@ -180,6 +181,13 @@ USES: list[tuple[str, int, str]] = [
     ("diff run route.csv", 2, "route.csv, is a file"),
     ("diff map.zarr other.zarr", 1, "other.zarr, schema"),
     ("diff run run --worse nan", 2, "worse, nan, metres"),
+    ("diff run run --fail-worse nan", 2, "--fail-worse, nan, above 0"),
+    ("diff run run --fail-worse 5cm", 2, "--fail-worse, number"),
+    ("diff run run --fail-worse 0.1 --over roads", 2, "--over, roads, segments"),
+    ("diff run run --fail-worse 0.1 --measure worst", 2, "--measure, worst, across"),
+    ("diff run run --report route.csv", 2, "route.csv, another folder"),
+    ("diff run run --report map.zarr", 2, "map.zarr, is a tile store, another folder"),
+    ("diff run --report made", 2, "run, was not updated, name two"),
     # pictures
     ("view map.zarr", 1, "no display, --screenshot"),
     ("view map.zarr --tile first", 2, "'first', 12_-3"),
@@ -269,6 +277,7 @@ CALLS: list[tuple[Callable[[], object], str]] = [
     (lambda: ts.plan("no_map.yaml"), "gone.pcd, check the path"),
     (lambda: ts.diff("map.zarr", "gone.zarr"), "gone.zarr, no tile store"),
     (lambda: ts.diff("run", "run", worse=-1.0), "worse, -1.0, metres"),
+    (lambda: write_diff(ts.diff("run", "run"), "route.csv"), "route.csv, another folder"),
     (lambda: ts.explain("rangemax"), "'rangemax', range_max"),
     (lambda: ts.dataset("run"), "dataset, tilestream run"),
     (lambda: ts.train_over({}), "no run"),

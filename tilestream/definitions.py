@@ -32,6 +32,7 @@ from tilestream.pipeline.stages.register import START_COLUMNS
 from tilestream.pipeline.stages.samples import COLUMNS as ALL_FACTORS
 from tilestream.pipeline.stages.samples import DATASET_COLUMNS, LOST_COLUMNS
 from tilestream.records import Column
+from tilestream.report.diff.gate import DiffGateSettings
 from tilestream.report.gate import GateSettings
 from tilestream.simulation.settings import SimulationSettings
 
@@ -60,6 +61,7 @@ GIVEN: dict[str, type[Settings]] = {
     "the job file": RunSettings,
     "the simulation file": SimulationSettings,
     "options of estimate and run": GateSettings,
+    "options of diff": DiffGateSettings,
 }
 """The settings, by where they are given."""
 

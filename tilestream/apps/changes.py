@@ -1,9 +1,5 @@
 """Places whose estimate a map update changed: by how much, over how much road, and why."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 import pandas as pd
 from scipy.spatial import cKDTree
@@ -15,10 +11,12 @@ from tilestream.model.features import with_derived
 from tilestream.model.phrases import PHRASES, REASSURING, phrase_of
 from tilestream.model.training import ESTIMATES, MAIN
 from tilestream.records import Float64
-from tilestream.report.segments import reaches, stretches
+from tilestream.report.diff.data import ENDS, OTHERS, Changes
 
 SAME_PLACE = 0.5
 """Sample points this near to each other are compared [m]: half their spacing."""
+NOWHERE_NEAR = 5.0
+"""An older place that is farther than this from all that are compared is left behind [m]."""
 FEWEST = 8
 """Places from which on a rank correlation says on which side of a factor errors are larger."""
 UNITS = {column.name: column.unit for column in (*catalogue.COLUMNS, *observability.COLUMNS)}
@@ -27,28 +25,9 @@ PARTS = {name: name for target, name in ESTIMATES.items() if target != MAIN}
 """The parts of an estimate, where nothing is known of the virtual drive."""
 NOTHING = "its factors are as they were: the model is another one"
 """Why an estimate changed where no factor did."""
-PLACE = ("route_id", "arc_length", "x", "y", "before", "after", "change", "length", "why")
-"""The columns of a place that changed."""
-
-
-@dataclass(frozen=True, eq=False)
-class Changes:
-    """How the estimates of places differ from earlier ones."""
-
-    worse: pd.DataFrame
-    """Places whose estimate grew by more than the limit, the worst first (`PLACE`; lengths and
-    errors in m)."""
-    better: pd.DataFrame
-    """Those whose estimate fell by more than that, the best first; without `why`."""
-    stretches: pd.DataFrame
-    """Stretches of road that got worse, the worst first: `route_id`, `begin`, `end`, `length` [m],
-    `places`, and of the place that got worse most `at`, `before`, `after` [m] and `why`."""
-    compared: int
-    """Places with an estimate in both."""
-    length: float
-    """Of road that they stand for [m]."""
-    lost: int
-    """Places that had an estimate and have none."""
+AT = ["route_id", "sample", "arc_length", "x", "y", "z"]
+COMPARED = ["before", "after", "why", "reason"]
+LEFT = ["route_id", "arc_length", "x", "y", "before"]
 
 
 def changes(old: pd.DataFrame | None, new: pd.DataFrame | None, limit: float) -> Changes:
@@ -60,27 +39,34 @@ def changes(old: pd.DataFrame | None, new: pd.DataFrame | None, limit: float) ->
         limit: what counts as worse or better [m].
     """
     if old is None or new is None or old.empty or new.empty:
-        none = pd.DataFrame(columns=list(PLACE))
-        return Changes(none, none, _stretches(none, np.zeros(0, bool)), 0, 0.0, 0)
+        return Changes(pd.DataFrame(columns=[*AT, *COMPARED]), pd.DataFrame(columns=LEFT), limit)
     now = new.sort_values(["route_id", "sample"], kind="stable").reset_index(drop=True)
     then = _beside(old, now)
     before, after = (table["estimate"].to_numpy(np.float64) for table in (then, now))
-    both = np.isfinite(before) & np.isfinite(after)
-    length = reaches(now)
-    change = after - before
-    table = now[["route_id", "arc_length", "x", "y"]].assign(
-        before=before, after=after, change=change, length=length, why=""
-    )
-    worse, better = both & (change > limit), both & (change < -limit)
-    table.loc[worse, "why"] = _reasons(then, now, np.flatnonzero(worse))
-    return Changes(
-        _sorted(table[worse], ascending=False),
-        _sorted(table[better], ascending=True).drop(columns="why"),
-        _stretches(table.assign(sample=now["sample"]), worse),
-        int(both.sum()),
-        float(length[both].sum()),
-        int((np.isfinite(before) & ~np.isfinite(after)).sum()),
-    )
+    others = {
+        f"{name}_{when}": table[name].to_numpy(np.float64) if name in table else np.nan
+        for name in (*OTHERS, *ENDS)
+        for when, table in (("before", then), ("after", now))
+    }
+    reason = now["reason"].fillna("").astype(str) if "reason" in now else ""
+    places = now[AT].assign(before=before, after=after, why="", reason=reason, **others)
+    found = Changes(places, _left(old, then), limit)
+    worse = found.rows("worse")
+    places.loc[worse, "why"] = _reasons(then, now, worse)
+    return found
+
+
+def _left(old: pd.DataFrame, then: pd.DataFrame) -> pd.DataFrame:
+    """The older places with an estimate that are near none of those that are compared."""
+    had = old[np.isfinite(old["estimate"].to_numpy(np.float64))]
+    at, taken = (table[["x", "y"]].to_numpy(np.float64) for table in (had, then))
+    taken = taken[np.isfinite(taken).all(axis=1)]
+    away = np.isfinite(at).all(axis=1)
+    if away.any() and len(taken):
+        distance, _ = cKDTree(taken - taken[0]).query(at[away] - taken[0])
+        away[away] = np.asarray(distance) > NOWHERE_NEAR
+    left: pd.DataFrame = had[away].rename(columns={"estimate": "before"})[LEFT]
+    return left.sort_values(["route_id", "arc_length"], kind="stable", ignore_index=True)
 
 
 def _beside(old: pd.DataFrame, now: pd.DataFrame) -> pd.DataFrame:
@@ -107,36 +93,6 @@ def _beside(old: pd.DataFrame, now: pd.DataFrame) -> pd.DataFrame:
     return then
 
 
-def _sorted(table: pd.DataFrame, *, ascending: bool) -> pd.DataFrame:
-    order = table.sort_values(
-        ["change", "route_id", "arc_length"], ascending=[ascending, True, True]
-    )
-    return order[list(PLACE)].reset_index(drop=True)
-
-
-def _stretches(places: pd.DataFrame, worse: np.ndarray) -> pd.DataFrame:
-    """Stretches of road that got worse, with what they bridge."""
-    rows: list[Mapping[str, Any]] = []
-    for part in stretches(places, np.flatnonzero(worse)) if worse.any() else ():
-        here = places.iloc[part]
-        worst = here.iloc[int(np.nanargmax(here["change"].to_numpy(np.float64)))]
-        rows.append(
-            {
-                "route_id": worst["route_id"],
-                "begin": here["arc_length"].iloc[0],
-                "end": here["arc_length"].iloc[-1],
-                "length": here["length"].sum(),
-                "places": len(here),
-                "at": worst["arc_length"],
-                **{name: worst[name] for name in ("x", "y", "before", "after", "why")},
-            }
-        )
-    names = ["route_id", "begin", "end", "length", "places", "at", "x", "y"]
-    found = pd.DataFrame(rows, columns=[*names, "before", "after", "why"])
-    grown = (found["after"] - found["before"]).to_numpy(np.float64)
-    return found.iloc[np.argsort(-grown, kind="stable")].reset_index(drop=True)
-
-
 def _reasons(then: pd.DataFrame, now: pd.DataFrame, rows: np.ndarray) -> list[str]:
     """Why each of these places got worse: what the virtual drive does there now, and the factor of
     the map that changed most on the side on which estimates are larger.
@@ -149,8 +105,9 @@ def _reasons(then: pd.DataFrame, now: pd.DataFrame, rows: np.ndarray) -> list[st
     a, b = (table[causes].to_numpy(np.float64) for table in (old, new))
     away = _weighed(b - a, b, new["estimate"].to_numpy(np.float64))
     parts = [name for name in AXES if name in both] or [name for name in PARTS if name in old]
+    had, has = (table[parts].to_numpy(np.float64) for table in (old, new))
     return [
-        "; ".join(filter(None, [_part(parts, old, new, row), _cause(causes, a, b, away, row)]))
+        "; ".join(filter(None, [_part(parts, had, has, row), _cause(causes, a, b, away, row)]))
         or NOTHING
         for row in rows.tolist()
     ]
@@ -172,16 +129,15 @@ def _weighed(step: Float64, values: Float64, estimate: Float64) -> Float64:
     return np.where(np.isfinite(weights), weights, 0.0)
 
 
-def _part(names: list[str], old: pd.DataFrame, new: pd.DataFrame, row: int) -> str:
+def _part(names: list[str], old: Float64, new: Float64, row: int) -> str:
     """The part of the error that grew most; empty: none did."""
-    grown = {name: float(new[name].iloc[row] - old[name].iloc[row]) for name in names}
-    grown = {name: step for name, step in grown.items() if step > 0.0}
-    if not grown:
+    step = np.nan_to_num(new[row] - old[row])
+    if not (step > 0.0).any():
         return ""
-    name = max(grown, key=lambda part: grown[part])
-    words = AXES.get(name, f"{name} grew")
-    values = (float(table[name].iloc[row]) for table in (new, old))
-    return f"{words} ({told_beside(name, 'm', *values, word='before')})"
+    k = int(step.argmax())
+    words = AXES.get(names[k], f"{names[k]} grew")
+    values = float(new[row, k]), float(old[row, k])
+    return f"{words} ({told_beside(names[k], 'm', *values, word='before')})"
 
 
 def _cause(names: list[str], old: Float64, new: Float64, away: Float64, row: int) -> str:

@@ -11,10 +11,9 @@ from tilestream.apps import verify as verifying
 from tilestream.cli.cluster import HERE, Cluster, on_cluster
 from tilestream.cli.fields import fields, with_settings
 from tilestream.cli.options import AsJson, DryRun, StoreUrl
-from tilestream.cli.printing import out, print_json, say, say_notes
+from tilestream.cli.printing import err, out, print_json, say, say_notes
 from tilestream.cli.progress import progress
 from tilestream.cli.tables import (
-    diff_facts,
     diff_table,
     ends_table,
     info_table,
@@ -22,13 +21,18 @@ from tilestream.cli.tables import (
     stretch_table,
     tile_table,
 )
-from tilestream.errors import PartialError
+from tilestream.errors import LimitError, PartialError
+from tilestream.files import Files
 from tilestream.pipeline.jobs import ingest as ingest_map
 from tilestream.pipeline.jobs.map_expected import tiles_to_read
 from tilestream.pipeline.jobs.map_update import Update, tiles_written
 from tilestream.pipeline.jobs.run_inputs import ingest_settings, scans_of
 from tilestream.pipeline.jobs.sources import map_notes
 from tilestream.pipeline.jobs.starts_of import starts_of as ends_of
+from tilestream.report import diff_gate, write_diff
+from tilestream.report.diff.data import WORSE
+from tilestream.report.diff.gate import DiffGateSettings
+from tilestream.report.diff.summary import diff_content
 from tilestream.settings import IngestSettings, LogOptions, LogSettings, MapSettings, PlaceSettings
 from tilestream.store import POINTS, TileStore, open_store
 
@@ -194,8 +198,10 @@ def info(
         out.print(info_table(found))
 
 
+@with_settings
 def diff(
     old: Annotated[str, typer.Argument(help="A run directory or tile store.")],
+    gate_of: Annotated[DiffGateSettings, fields("fail_worse", "measure", "over")],
     new: Annotated[
         str | None,
         typer.Argument(
@@ -204,22 +210,42 @@ def diff(
     ] = None,
     worse: Annotated[
         float, typer.Option(help="Estimates that grew by more than this are worse [m].")
-    ] = map_diff.WORSE,
+    ] = WORSE,
+    report: Annotated[
+        str | None, typer.Option(help="Folder of a page of it, `diff.html`, and its figures.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """What a map update changes: tiles, and how much road got worse, where and why."""
+    """What a map update changes: tiles, and how much road got worse, where and why.
+
+    - `tilestream diff old-run new-run --report changes`: a page, before and after on one map
+
+    - `tilestream diff run --fail-worse 0.05`: a gate, on what the last update of its map changed
+    """
     found = map_diff.diff(old, new, worse=worse)
+    verdict = None
+    if gate_of.fail_worse is not None:
+        verdict = diff_gate(found, gate_of.fail_worse, gate_of.measure, gate_of.over)
+    content = diff_content(found, verdict)
+    if report is not None:
+        write_diff(found, report, verdict)
     if as_json:
-        print_json(diff_facts(found))
+        print_json(content)
     else:
         out.print(diff_table(found))
         if len(found.places.stretches):
             out.print(stretch_table(found))
         say_notes(found.notes)
+        if report is not None:
+            say(f"The page is at {Files.at(report).under('diff.html').address}")
+    if verdict is not None and not verdict.closed:
+        say(verdict.told, to=err)
     if found.gone:
         raise PartialError(
             "no tiles are compared, estimates only; a map is gone:", dict(found.gone)
         )
+    if verdict is not None and verdict.closed:
+        raise LimitError(verdict.told)
 
 
 def print_sources(store: TileStore) -> None:

@@ -8,12 +8,12 @@ import pandas as pd
 from rich.box import SIMPLE
 from rich.table import Table
 
-from tilestream.apps.diff import MapDiff
 from tilestream.apps.info import Info
 from tilestream.crs import named
 from tilestream.factors.catalogue import COLUMNS
 from tilestream.label import FAILED
 from tilestream.pipeline.engine.plan import Plan, megabytes
+from tilestream.report.diff.data import TILES, MapDiff
 from tilestream.report.drives import DriveMeasured
 from tilestream.report.formatting import cm, cm_about, distance
 from tilestream.report.paper_tables import LIMITS
@@ -217,7 +217,6 @@ def report_table(report: dict[str, Any], figures: Sequence[tuple[str, str]]) -> 
     return table
 
 
-TILE_CHANGES = ("added", "removed", "changed")
 STRETCHES = 10
 """Stretches of road that a table shows."""
 
@@ -228,7 +227,7 @@ def diff_table(found: MapDiff) -> Table:
     table.add_column()
     table.add_column(justify="right", no_wrap=True)
     table.add_column()
-    for kind in TILE_CHANGES:
+    for kind in TILES:
         keys = [str(key) for key in getattr(found, kind)]
         more = " …" if len(keys) > 10 else ""
         count = "not compared" if found.gone else f"{len(keys):,}"
@@ -242,6 +241,10 @@ def diff_table(found: MapDiff) -> Table:
         table.add_row(f"got {what} {by}", length, f"{len(rows):,} sample points")
     if places.lost:
         table.add_row("lost their estimate", "", f"{places.lost:,} sample points")
+    if places.appeared:
+        table.add_row("have one for the first time", "", f"{places.appeared:,} sample points")
+    if len(places.left):
+        table.add_row("not asked for any more", "", f"{len(places.left):,} sample points")
     return table
 
 
@@ -259,28 +262,6 @@ def stretch_table(found: MapDiff) -> Table:
         errors = (cm(row[name]) for name in ("before", "after"))
         table.add_row(str(row["route_id"]), *where, *errors, row["why"])
     return table
-
-
-def diff_facts(found: MapDiff) -> dict[str, Any]:
-    """The same for machines: null for what could not be compared."""
-    places = found.places
-    tables = {name: getattr(places, name) for name in ("worse", "better", "stretches")}
-    tiles: dict[str, Any] = dict.fromkeys((*TILE_CHANGES, "same"))
-    if not found.gone:
-        tiles = {kind: [str(key) for key in getattr(found, kind)] for kind in TILE_CHANGES}
-        tiles["same"] = found.same
-    return {
-        **tiles,
-        "compared": places.compared,
-        "compared_m": places.length,
-        "limit": found.limit,
-        "worse_m": float(places.worse["length"].sum()),
-        "better_m": float(places.better["length"].sum()),
-        "lost": places.lost,
-        "notes": found.notes,
-        "gone": found.gone,
-        **{name: rows.to_dict("records") for name, rows in tables.items()},
-    }
 
 
 def comparison_table(content: dict[str, Any]) -> Table:

@@ -4,12 +4,23 @@
 data (Findings) --> segments (worst places) --> summary --+--> exports (parquet, geojson, …)
                                                           +--> charts, pictures --> page --> HTML
 comparison (Comparison) ----------------------------------+                (templates/)
+diff_data (MapDiff) --> diff_gate, diff_summary --> diff_write (diff_page, GeoJSON)
 ```
 """
 
 from tilestream.report.data import Findings
+from tilestream.report.diff.gate import diff_gate
+from tilestream.report.diff.write import write_diff
 from tilestream.report.gate import gate
 from tilestream.report.summary import cards
 from tilestream.report.write import write_comparison, write_report
 
-__all__ = ["Findings", "cards", "gate", "write_comparison", "write_report"]
+__all__ = [
+    "Findings",
+    "cards",
+    "diff_gate",
+    "gate",
+    "write_comparison",
+    "write_diff",
+    "write_report",
+]

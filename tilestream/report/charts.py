@@ -49,9 +49,9 @@ def path_chart(found: Findings, path: str, target: str) -> dict[str, Any]:
 
     The data sources are named by their group, and `estimate`; lengths in centimetres.
     """
-    plot = _new_road(280, "error [cm]")
+    plot = new_road(280, "error [cm]")
     lines = path_lines(found, path)
-    _band(plot, lines.estimate)
+    band(plot, lines.estimate)
     for number, (group, columns) in enumerate(lines.measured.items()):
         plot.line(
             "arc",
@@ -80,7 +80,7 @@ def profile_chart(found: Findings, route_id: str, target: str) -> dict[str, Any]
     The data sources are named `profile` and `measured`; lengths in centimetres, x and y [m, map
     frame].
     """
-    plot = _new_road(270, "error [cm]")
+    plot = new_road(270, "error [cm]")
     plot.name, plot.tags = "profile", [route_id]  # by which the page finds it
     rows = found.places[found.places["route_id"].astype(str) == route_id]
     estimate, measured = estimates(rows), measure_of(rows).measured
@@ -98,7 +98,7 @@ def profile_chart(found: Findings, route_id: str, target: str) -> dict[str, Any]
         "interval": [cm_span(a, b, found.digits) for a, b in zip(low, high, strict=True)],
         **{axis: rows[axis].to_numpy(np.float64) for axis in "xy"},
     }
-    _band(plot, columns)
+    band(plot, columns)
     source = ColumnDataSource(columns, name="profile")
     of_line: dict[str, Any] = {"color": HELD_OUT, "line_width": 1.8, "legend_label": "estimate"}
     line = plot.line("arc", "estimate", source=source, **of_line)
@@ -119,7 +119,9 @@ def profile_chart(found: Findings, route_id: str, target: str) -> dict[str, Any]
     return item(plot, target)
 
 
-def _band(plot: figure, columns: dict[str, Any]) -> None:
+def band(
+    plot: figure, columns: dict[str, Any], colour: str = HELD_OUT, name: str = "its interval"
+) -> None:
     """The interval as a polygon per unbroken stretch."""
     known = np.flatnonzero(np.isfinite(columns["low"]) & np.isfinite(columns["arc"]))
     runs = [run for run in np.split(known, np.flatnonzero(np.diff(known) != 1) + 1) if run.size > 1]
@@ -128,10 +130,10 @@ def _band(plot: figure, columns: dict[str, Any]) -> None:
         plot.patches(
             [np.concatenate([arc[r], arc[r][::-1]]).tolist() for r in runs],
             [np.concatenate([low[r], high[r][::-1]]).tolist() for r in runs],
-            color=HELD_OUT,
+            color=colour,
             alpha=0.18,
             line_width=0,
-            legend_label="its interval",
+            legend_label=name,
         )
 
 
@@ -140,7 +142,7 @@ def route_chart(found: Comparison, route_id: str, target: str) -> dict[str, Any]
 
     The data sources are named after the choices; lengths in centimetres.
     """
-    plot = _new_road(340, "estimated error [cm]")
+    plot = new_road(340, "estimated error [cm]")
     rows = found.rows[found.rows["route_id"] == route_id]
     every = line_shows_every(found)
     styles = itertools.cycle(itertools.product(DASHES, CHOICES))
@@ -190,7 +192,7 @@ def hover(glyphs: "GlyphRenderer[Any]", tip: Any, **options: Any) -> HoverTool:
     )
 
 
-def _new_road(height: int, y: str) -> figure:
+def new_road(height: int, y: str) -> figure:
     """An empty chart of errors along a road."""
     return new_plot(height, "along [m]", y, ROAD_TOOLS, y_range=DataRange1d(start=0))
 

@@ -78,8 +78,8 @@ def city_map(found: Findings, tip: str) -> dict[str, Any]:
     estimate = estimates(places)
     plot = new_plot(600, "x", "y", MAP_TOOLS, match_aspect=True)
     drawn = worst_of_every(map_shows_every(found), places["route_id"], estimate)
-    origin = _origin(places)
-    _draw_map(plot, found.above, origin)
+    origin = origin_of(places)
+    draw_map(plot, found.above, origin)
     kinds = _kinds(places)
     mapper = LinearColorMapper(palette=found.scale.colours, low=0, high=len(found.scale.colours))
     for kind, marker, name in (
@@ -104,21 +104,31 @@ def city_map(found: Findings, tip: str) -> dict[str, Any]:
         plot.add_tools(hover(glyphs, tip, sort_by=[("estimate", -1)]))
     _draw_measured(plot, found, origin, (tip, mapper))
     _number_the_worst(plot, places, origin)
-    plot.name, plot.tags = "city-map", origin.tolist()  # by which the page finds a place on it
-    here = ColumnDataSource({"x": [], "y": []}, name="here")
-    plot.scatter("x", "y", source=here, size=26, fill_alpha=0.0, line_width=3, line_color=HERE)
+    mark_here(plot, origin)
     if np.isfinite(estimate).any():
-        plot.add_layout(_colour_bar(found.scale, mapper), "below")
-    plot.xaxis.axis_label, plot.yaxis.axis_label = (
-        f"{axis} [m] from {value:.0f} on" if value else f"{axis} [m]"
-        for axis, value in zip("xy", origin, strict=True)
-    )
+        plot.add_layout(colour_bar(found.scale, mapper), "below")
+    name_axes(plot, origin)
     finish(plot)
     plot.legend.ncols = 2  # so that it fits a phone
     return item(plot, "city-map")
 
 
-def _draw_map(plot: figure, above: FromAbove | None, origin: Float64) -> None:
+def mark_here(plot: figure, origin: Float64) -> None:
+    """The ring round the place that the address names, and by what the page finds the map."""
+    plot.name, plot.tags = "city-map", origin.tolist()
+    here = ColumnDataSource({"x": [], "y": []}, name="here")
+    plot.scatter("x", "y", source=here, size=26, fill_alpha=0.0, line_width=3, line_color=HERE)
+
+
+def name_axes(plot: figure, origin: Float64) -> None:
+    """What the axes of a map are, and from where they count."""
+    plot.xaxis.axis_label, plot.yaxis.axis_label = (
+        f"{axis} [m] from {value:.0f} on" if value else f"{axis} [m]"
+        for axis, value in zip("xy", origin, strict=True)
+    )
+
+
+def draw_map(plot: figure, above: FromAbove | None, origin: Float64) -> None:
     """The map itself below all else, how long it is, and where north is."""
     plot.add_layout(ScaleBar(**SCALE_BAR))
     plot.add_layout(Label(**NORTH))
@@ -143,13 +153,13 @@ def _choosable() -> CDSView:
     return CDSView(filter=BooleanFilter(booleans=None))
 
 
-def _colour_bar(scale: Scale, mapper: LinearColorMapper) -> ColorBar:
+def colour_bar(scale: Scale, mapper: LinearColorMapper, title: str = "error [cm]") -> ColorBar:
     """Equally wide steps, with the error between two of them; below the map, which is narrow on
     a phone.
     """
     return ColorBar(
         color_mapper=mapper,
-        title="error [cm]",
+        title=title,
         height=12,
         padding=4,
         ticker=FixedTicker(ticks=list(range(1, len(scale.colours)))),
@@ -171,7 +181,7 @@ def _kinds(places: pd.DataFrame) -> NDArray[np.str_]:
     return np.where(known, [names[like] for like in like_training(places)], "missing")
 
 
-def _origin(places: pd.DataFrame) -> Float64:
+def origin_of(places: pd.DataFrame) -> Float64:
     """A round corner near the places, so that axes need not show seven digits [m]."""
     at = places[["x", "y"]].to_numpy(np.float64)
     at = at[np.isfinite(at).all(axis=1)]

@@ -21,6 +21,17 @@ NAMED = 5
 """Routes that are named where a gate stays closed."""
 
 
+def positive(limit: float | None) -> float | None:
+    """The limit of a gate as it was given; a field's own check.
+
+    Raises:
+        ValueError: it is no length above 0.
+    """
+    if limit is not None and not (np.isfinite(limit) and limit > 0.0):
+        raise ValueError(f"is {limit!r}: give metres above 0")
+    return limit
+
+
 class GateSettings(Settings):
     """What a gate asks for."""
 
@@ -36,12 +47,7 @@ class GateSettings(Settings):
     over: Over = "places"
     """Of what --fail-over asks: single places, or means over 12 m."""
 
-    @field_validator("fail_over")
-    @classmethod
-    def _positive(cls, limit: float | None) -> float | None:
-        if limit is not None and not (np.isfinite(limit) and limit > 0.0):
-            raise ValueError(f"is {limit!r}: give metres above 0")
-        return limit
+    _positive = field_validator("fail_over")(positive)
 
 
 def gate(
@@ -76,7 +82,7 @@ def gate(
     judged = places[["route_id", "arc_length"]].assign(
         error=known_error, measured=known_error == one.measured
     )
-    judged = _windows(judged) if over == "segments" else judged
+    judged = windows(judged) if over == "segments" else judged
     above = judged[judged["error"] > limit]
     if len(above):
         worst = above.iloc[int(np.argmax(above["error"]))]
@@ -90,18 +96,18 @@ def gate(
     known = pd.Series(np.isfinite(estimate)).groupby(places["route_id"].to_numpy(str)).mean()
     blind = known.index[known == 0.0].tolist()
     if blind:
-        found.append(f"no estimate at all on {_named(blind)}")
+        found.append(f"no estimate at all on {named(blind)}")
     hardly = known[(known > 0.0) & (known < EVALUATED)]
     if len(hardly):
         told = [f"{route} ({share:.0%})" for route, share in hardly.items()]
-        found.append(f"less than {EVALUATED:.0%} of the places have an estimate on {_named(told)}")
+        found.append(f"less than {EVALUATED:.0%} of the places have an estimate on {named(told)}")
     unseen = [
         f"{one['drive']} ({one['measured']:,} of {one['scans']:,} scans)"
         for one in drives
         if not one["evaluated"]
     ]
     if unseen:
-        found.append(f"less than {EVALUATED:.0%} was measured of drive {_named(unseen)}")
+        found.append(f"less than {EVALUATED:.0%} was measured of drive {named(unseen)}")
     missing = int(np.isnan(estimate).sum())
     if missing > MISSING * total:
         found.append(
@@ -111,7 +117,7 @@ def gate(
     return found
 
 
-def _windows(judged: pd.DataFrame) -> pd.DataFrame:
+def windows(judged: pd.DataFrame) -> pd.DataFrame:
     """Means of `error` over each `SEGMENT` of a route, of the places that have one; `measured`
     where any of them is.
     """
@@ -122,5 +128,6 @@ def _windows(judged: pd.DataFrame) -> pd.DataFrame:
     return parts.agg(how).reset_index()
 
 
-def _named(names: Sequence[str]) -> str:
+def named(names: Sequence[str]) -> str:
+    """The first of some names, for a message."""
     return ", ".join(names[:NAMED]) + (", …" if len(names) > NAMED else "")

@@ -43,6 +43,17 @@ class Measure:
         return larger
 
 
+def estimated_column(measure: str) -> str:
+    """Name of the column of estimates: `estimate` of the mean.
+
+    Raises:
+        UsageError: no such measure.
+    """
+    if measure not in MEASURES:
+        raise UsageError(f"no measure {measure!r}: choose from {', '.join(MEASURES)}")
+    return ESTIMATES[MEASURES[measure]]
+
+
 def measured_column(measure: str) -> str:
     """Name of the column of measured errors beside the estimates: `measured` of the mean."""
     return "measured" if measure == "mean" else f"measured_{measure}"
@@ -92,12 +103,10 @@ def measure_of(places: pd.DataFrame, name: str = "mean") -> Measure:
     Raises:
         UsageError: no such measure.
     """
-    if name not in MEASURES:
-        raise UsageError(f"no measure {name!r}: choose from {', '.join(MEASURES)}")
-    column = measured_column(name)
+    estimated, column = estimated_column(name), measured_column(name)
     nothing = np.full(len(places), np.nan)
     return Measure(
         name,
-        places[ESTIMATES[MEASURES[name]]].to_numpy(np.float64),
+        places[estimated].to_numpy(np.float64),
         places[column].to_numpy(np.float64) if column in places else nothing,
     )

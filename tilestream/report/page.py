@@ -83,6 +83,8 @@ def _environment() -> Environment:
 
 
 _ENVIRONMENT = _environment()
+template = _ENVIRONMENT.get_template
+"""A template by its name."""
 
 
 def report_page(
@@ -104,20 +106,21 @@ def report_page(
     segments = sorted(content["segments"], key=lambda s: (-s["worst"], s["route_id"], s["begin"]))
     profiles = [route for route in _worst_first(content["routes"]) if route["p95"] is not None]
     profiles = profiles[:MOST_PROFILES]
-    tip = _ENVIRONMENT.get_template("map_tip.html.j2").render()
+    tip = template("map_tip.html.j2").render()
     turning = any(view.cloud for view in views)
-    return _render(
+    return render_page(
         "report.html.j2",
         content,
-        ("page.js", "cloud.js", "place.js", "choose.js"),
-        [viewer()] if turning else [],
-        FILES,
         [city_map(found, tip)]
         + [
             charts.profile_chart(found, route["route_id"], f"along-{k}")
             for k, route in enumerate(profiles)
         ]
         + [charts.path_chart(found, path["path"], f"path-{k}") for k, path in enumerate(paths)],
+        FILES,
+        scripts=("page.js", "enter.js", "cloud.js", "place.js", "choose.js"),
+        later=[viewer()] if turning else [],
+        limit=formatting.cm(content["threshold"], 0),
         cards=cards(content),
         digits=digits_of(content),
         routes=_listed_routes(content["routes"]),
@@ -184,13 +187,12 @@ def comparison_page(found: Comparison, content: Mapping[str, Any]) -> str:
         content: its `content`.
     """
     routes = content["routes"][:MOST_CHARTS]
-    return _render(
+    return render_page(
         "comparison.html.j2",
         content,
-        ("page.js",),
-        [],
-        COMPARE_FILES,
         [charts.route_chart(found, name, f"route-{k}") for k, name in enumerate(routes)],
+        COMPARE_FILES,
+        limit=formatting.cm(content["threshold"], 0),
         routes=routes,
         absent={},
         vehicles=[(of, _listed_tiles(of["tiles"])) for of in content["cell_sizes"]],
@@ -200,40 +202,38 @@ def comparison_page(found: Comparison, content: Mapping[str, Any]) -> str:
     )
 
 
-def _render(
-    template: str,
+def render_page(
+    name: str,
     content: Mapping[str, Any],
-    ours: Sequence[str],
-    later: Sequence[str],
-    files: Mapping[str, str],
     items: Sequence[Mapping[str, Any]],
+    files: Mapping[str, str],
+    *,
+    scripts: Sequence[str] = ("page.js",),
+    later: Sequence[str] = (),
     **more: Any,
 ) -> str:
-    """A page of these templates of scripts and these charts; what else the template asks for is
-    `more`.
+    """A template filled: with its content, its charts, and what they and the page need to run.
 
     Args:
-        template: its name.
+        name: of the template.
         content: what is told.
-        ours: scripts of ours, the first one first.
-        later: scripts that these may begin.
-        files: what lies beside the page, by name.
         items: its charts.
+        files: what lies beside the page and what it is for, by name.
+        scripts: templates of scripts, in order.
+        later: other scripts, which these may begin.
         more: what else the template asks for.
     """
     # BokehJS without widgets, tables and what needs a server
     bokeh = Resources(mode="inline", components=["bokeh"]).js_raw[0]
-    own = "\n".join(_ENVIRONMENT.get_template(name).render() for name in ours)
-    scripts = [bokeh, own]
-    return _ENVIRONMENT.get_template(template).render(
+    run = [bokeh, "\n".join(template(script).render() for script in scripts)]
+    return template(name).render(
         content=content,
         noticed=shared(content["notes"]),
         evaluated_share=EVALUATED,
         charts=items,
-        scripts=[Markup(script) for script in scripts],
-        policy=_policy([*scripts, *later]),
+        scripts=[Markup(script) for script in run],
+        policy=_policy([*run, *later]),
         files=files.items(),
-        limit=formatting.cm(content["threshold"], 0),
         **more,
     )
 

@@ -1,8 +1,12 @@
 "use strict";
 const ready = []; // what begins as soon as the charts are drawn
 
+function rootsNamed(name) {
+  return Bokeh.documents.flatMap((doc) => doc.roots()).filter((root) => root.name === name);
+}
+
 function rootNamed(name) {
-  return Bokeh.documents.flatMap((doc) => doc.roots()).find((root) => root.name === name);
+  return rootsNamed(name)[0];
 }
 
 // Shows so much of a map round a point, and at least the streets beside it; axes stay equal.
@@ -55,6 +59,7 @@ function frame(map, x, y, width, height) {
     window.addEventListener("beforeprint", paint);
     window.addEventListener("afterprint", paint);
     ready.forEach((begin) => begin());
+    window.dispatchEvent(new Event("hashchange")); // the place that the address names already
     document.documentElement.dataset.charts = String(items.length);
   });
 })();

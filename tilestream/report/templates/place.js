@@ -1,5 +1,4 @@
-// One place that the page is about: on the map, in the panel beside it, in its profile. The address
-// names it, `#x=…&y=…` in the map's frame, so that a link to it can be sent.
+// The panel beside the map: what is known of the place that was entered, and what it looks like.
 ready.push(() => {
   const panel = document.getElementById("place");
   const map = rootNamed("city-map");
@@ -9,7 +8,7 @@ ready.push(() => {
   const part = (name) => panel.querySelector(`[data-part=${name}]`);
   const worst = JSON.parse(document.getElementById("worst-places").textContent);
   const sources = [...map.references()].filter((model) => model.type === "ColumnDataSource" && model.data.route);
-  const profiles = Bokeh.documents.flatMap((doc) => doc.roots()).filter((root) => root.name === "profile");
+  const profiles = rootsNamed("profile");
   const [left, low] = map.tags;
   let rank = -1; // of the place among the worst; -1: it is none of them
   let turning = false;
@@ -26,10 +25,6 @@ ready.push(() => {
       }
     }
     return found;
-  }
-
-  function address(x, y) {
-    return `x=${x.toFixed(1)}&y=${y.toFixed(1)}`;
   }
 
   function fact(name, value) {
@@ -64,7 +59,7 @@ ready.push(() => {
     }
   }
 
-  function show(x, y, moves) {
+  function show(x, y) {
     const found = nearest(x, y);
     if (!found) {
       return;
@@ -85,28 +80,11 @@ ready.push(() => {
     part("around").replaceChildren(...around);
     part("ends").replaceChildren(...ends);
     part("none").hidden = around.length + ends.length > 0;
-    for (const model of map.references()) {
-      if (model.name === "here") {
-        model.data = { x: [x - left], y: [y - low] };
-      }
-    }
     for (const profile of profiles) {
       const line = [...profile.references()].find((model) => model.name === "here");
       line.setv({ location: found.arc, visible: profile.tags[0] === found.route });
     }
-    if (moves) {
-      frame(map, x - left, y - low, 0, 0);
-      document.getElementById("map").scrollIntoView();
-    }
     turn();
-  }
-
-  function go() {
-    const at = new URLSearchParams(location.hash.slice(1));
-    const [x, y] = [Number.parseFloat(at.get("x")), Number.parseFloat(at.get("y"))];
-    if (Number.isFinite(x) && Number.isFinite(y)) {
-      show(x, y, true);
-    }
   }
 
   function step(by) {
@@ -115,24 +93,6 @@ ready.push(() => {
     location.hash = address(next.x, next.y);
   }
 
-  // A click into a profile names the nearest place of it.
-  function listen(profile) {
-    const places = [...profile.references()].find((model) => model.name === "profile" && model.data);
-    profile.on_event("tap", (event) => {
-      const { arc, x, y } = places.data;
-      let nearest = -1;
-      for (let k = 0; k < arc.length; k++) {
-        if (Number.isFinite(x[k]) && !(Math.abs(arc[k] - event.x) >= Math.abs(arc[nearest] - event.x))) {
-          nearest = k;
-        }
-      }
-      if (nearest >= 0) {
-        location.hash = address(x[nearest], y[nearest]);
-      }
-    });
-  }
-
-  profiles.forEach(listen);
   map.on_event("tap", (event) => {
     const found = nearest(event.x + left, event.y + low);
     const pixel = (map.x_range.end - map.x_range.start) / map.inner_width;
@@ -148,9 +108,8 @@ ready.push(() => {
     turning = true;
     turn();
   });
-  window.addEventListener("hashchange", go);
+  entered.push(show);
   if (worst.length) {
-    show(worst[0].x, worst[0].y, false);
+    enter(worst[0].x, worst[0].y, false);
   }
-  go();
 });
