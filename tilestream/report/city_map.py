@@ -109,7 +109,7 @@ def city_map(found: Findings, tip: str) -> dict[str, Any]:
         plot.add_layout(colour_bar(found.scale, mapper), "below")
     name_axes(plot, origin)
     finish(plot)
-    plot.legend.ncols = 2  # so that it fits a phone
+    plot.legend.ncols, plot.legend.spacing = 2, 6  # so that it fits a phone
     return item(plot, "city-map")
 
 

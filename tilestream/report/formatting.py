@@ -12,6 +12,8 @@ _GLUE = "\u00a0"
 NONE = "none"
 """Stands where there is no figure."""
 DASH = "–"
+MOST_TOLD = 8
+"""Values of a list that are told."""
 
 
 def known(value: Any) -> bool:
@@ -82,9 +84,11 @@ def megabytes(size: Any) -> str:
 
 
 def fact(value: Any) -> str:
-    """A setting, a version, a list of them."""
+    """A setting, a version, a list of them; of a long list the first, and how many there are."""
     if isinstance(value, list):
-        return ", ".join(map(str, value)) or DASH
+        told = ", ".join(map(str, value[:MOST_TOLD])) or DASH
+        more = len(value) - MOST_TOLD
+        return f"{told} and {more} more (report.json)" if more > 0 else told
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
