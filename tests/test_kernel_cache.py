@@ -208,3 +208,56 @@ def test_every_kernel_takes_this_decision() -> None:
         if isinstance(node, ast.Import) or node.module == "numba"
     }
     assert not decorators & {"numba", "njit", "jit", "vectorize", "guvectorize"}
+
+
+COMPILED = """
+from multiprocessing import get_context
+import numba.core.event as event
+
+class Listener(event.Listener):
+    def __init__(self):
+        self.names = []
+    def on_start(self, started):
+        self.names.append(started.data["dispatcher"].__name__)
+    def on_end(self, ended):
+        pass
+
+def compiled(_):
+    heard = Listener()
+    event.register("numba:compile", heard)
+    import numpy as np
+    from tilestream.kernels import newton
+    newton.raw_step(np.ones(6), np.eye(6), 0.1, 0.0, np.empty(6))
+    return [name for name in heard.names if hasattr(newton, name)]
+
+if __name__ == "__main__":
+    with get_context("spawn").Pool(3) as pool:
+        each = pool.map(compiled, range(3), chunksize=1)
+    print(*(name for names in each for name in names))
+"""
+
+
+@posix
+def test_of_several_processes_one_compiles_a_kernel(installation: Installation) -> None:
+    names, _ = installation.start(COMPILED)
+    assert "raw_step" in names
+    assert len(names) == len(set(names))
+
+
+@posix
+def test_a_process_that_is_killed_while_it_compiles_stops_nobody(
+    installation: Installation,
+) -> None:
+    killed = SUMS.replace(
+        "one, out",
+        "import os, signal, numba.core.event as event\n"
+        "class Kill(event.Listener):\n"
+        "    def on_start(self, started): os._exit(0)\n"
+        "    def on_end(self, ended): pass\n"
+        "event.register('numba:compile', Kill())\n"
+        "one, out",
+        1,
+    )
+    assert installation.start(killed) == ([], [])
+    assert list(installation.pycache.glob("*.lock"))
+    assert installation.start() == ([str(installation.pycache), "0"], [])

@@ -1,8 +1,9 @@
 """Where compiled kernels are kept: in a folder that nobody else can write, or nowhere.
 
-Compiling takes minutes, so Numba keeps the result on disk, as pickles: whoever can write the folder
-runs code as its reader. Numba does not look who can, and refuses to start where it finds no folder.
-So a place is chosen once for a process, before its first kernel is decorated.
+Compiling takes a minute, so Numba keeps the result on disk, as pickles: whoever can write the
+folder runs code as its reader. Numba does not look who can, and refuses to start where it finds no
+folder. So a place is chosen once for a process, before its first kernel is decorated. Of several
+processes one compiles a kernel; the others wait for it and read what it made.
 """
 
 import logging
@@ -11,16 +12,29 @@ import os
 import stat
 import sys
 import tempfile
-from functools import partial
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, Protocol, TypeVar
 
 import numba
+from numba.core.compiler_lock import global_compiler_lock
+from numba.core.dispatcher import Dispatcher
 
 if sys.platform != "win32":
+    import fcntl
     import grp
     import pwd
 
 logger = logging.getLogger(__name__)
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+class Decorator(Protocol):
+    """Makes a kernel of a function."""
+
+    def __call__(self, function: F, /) -> "Dispatcher[F]":
+        """The kernel."""
 
 
 def _is_own(group: int) -> bool:
@@ -99,5 +113,47 @@ def _settle() -> bool:
     return other is not None
 
 
-njit = partial(numba.njit, cache=_settle())
-"""Numba's decorator for every kernel of this package."""
+_KEPT = _settle()
+"""Whether compiled kernels are kept."""
+
+
+def njit(**options: Any) -> Decorator:
+    """Numba's decorator for every kernel of this package; one process compiles it at a time, the
+    next finds it on disk.
+    """
+
+    def decorate(function: F) -> "Dispatcher[F]":
+        kernel: Dispatcher[F] = numba.njit(cache=_KEPT, **options)(function)
+        if not isinstance(kernel, Dispatcher) or kernel.stats.cache_path is None:
+            return kernel  # interpreted, or compiled by every process anew
+        lock = Path(kernel.stats.cache_path) / f"{function.__name__}.lock"
+        compile_here = kernel.compile
+
+        def compile_once(signature: Any) -> Any:
+            # Numba's own lock first: threads that take the two in another order would wait for ever
+            with global_compiler_lock, _alone(lock):
+                return compile_here(signature)
+
+        setattr(kernel, "compile", compile_once)  # noqa: B010 - a method, to mypy
+        return kernel
+
+    return decorate
+
+
+@contextmanager
+def _alone(lock: Path) -> Iterator[None]:
+    """Be the only process in here; where a file cannot be locked, one of several."""
+    if sys.platform == "win32":
+        yield
+        return
+    try:
+        lock.parent.mkdir(parents=True, exist_ok=True)
+        file = os.open(lock, os.O_RDWR | os.O_CREAT, 0o600)
+    except OSError:
+        yield
+        return
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(file)
