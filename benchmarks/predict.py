@@ -63,7 +63,7 @@ from tilestream.pipeline.stages import predict as predict_stage
 from tilestream.pipeline.stages.samples import places_with_factors
 from tilestream.pipeline.stages.train import ModelInUse
 from tilestream.report import Findings
-from tilestream.report.exports import write_geoparquet
+from tilestream.report.exports.tables import write_geoparquet
 
 REPEATS = 3
 

@@ -19,7 +19,7 @@ FLOORS = (
     ("settings",),
     ("ndt", "preprocessing"),
     ("store", "tables", "formats", "simulation"),
-    ("from_above", "local_map"),
+    ("from_above", "local_map", "thinned"),
     ("registration",),
     ("label",),
     ("factors",),
@@ -46,6 +46,7 @@ KNOWN_ONLY_BY = {
     "typer": {"cli"},
     "jinja2": {"report"},
     "k3d": {"report"},
+    "pyogrio": {"report"},
 }
 OF_FORMATS = re.compile(r"tilestream\.formats\.logs\.(mcap|ros)")
 """One format of logs: everything else reads any log, through `formats.logs`."""

@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 import sys
+import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -797,6 +798,19 @@ def test_without_routes_all_streets_of_the_map_are_estimated(
     assert places.loc["3", "estimate"].isna().all()
     assert places.loc["3", "reason"].str.contains("no estimate").all()
     assert note in html.unescape((tmp_path / "run" / "report" / "index.html").read_text())
+    copy = ET.parse(tmp_path / "run" / "report" / "lanelets.osm").getroot()
+    tags = {
+        relation.get("id"): {str(tag.get("k")): str(tag.get("v")) for tag in relation.iter("tag")}
+        for relation in copy.iter("relation")
+    }
+    mean = places.loc["1", "estimate"].mean()
+    assert float(tags["1"]["tilestream:error"]) == pytest.approx(mean, abs=6e-4)
+    assert tags["1"]["tilestream:places"] == str(len(places.loc["1"]))
+    assert "shorter than their spacing" in tags["2"]["tilestream:reason"]
+    assert "no estimate" in tags["3"]["tilestream:reason"]
+    told = json.loads((tmp_path / "run" / "report" / "report.json").read_text())
+    assert told["not_written"] == {}
+    assert told["foxglove"]["map_points"] > 1000
     (autoware / "lanelet2_map.osm").unlink()
     with pytest.raises(UsageError, match=r"no routes: give files of routes.*lanelet2_map\.osm"):
         forecast(settings)

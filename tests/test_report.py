@@ -36,7 +36,7 @@ from tilestream.records import Float64
 from tilestream.report import Findings, gate, write_report
 from tilestream.report.city_map import MOST, city_map
 from tilestream.report.colours import FIXED, MISSING, THRESHOLDS, scale_of
-from tilestream.report.exports import write_csv, write_geoparquet
+from tilestream.report.exports.tables import write_csv, write_geoparquet
 from tilestream.report.lines import with_gaps
 from tilestream.report.segments import BRIDGE, reaches, segments, worst_places
 from tilestream.report.summary import plain
@@ -44,9 +44,12 @@ from tilestream.report.summary import plain
 FILES = (
     "index.html",
     "places.parquet",
-    "over_threshold.geojson",
+    "places.gpkg",
     "places.csv",
+    "over_threshold.geojson",
+    "over_threshold.qml",
     "map.pcd",
+    "foxglove.mcap",
     "report.json",
 )
 

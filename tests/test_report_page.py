@@ -35,6 +35,7 @@ from tilestream.model.registry import COMPETITORS
 from tilestream.model.splits import PROTOCOLS
 from tilestream.report import Findings, write_report
 from tilestream.report.city_map import city_map
+from tilestream.report.columns import CATALOGUE
 from tilestream.report.evaluation import MODELS, PAPER_IMPORTANCES, PARTS, PROTOCOL_NAMES, worth
 from tilestream.report.formatting import cm, cm_by_name, cm_span, percent
 from tilestream.report.page import report_page
@@ -73,7 +74,7 @@ def text_of(page: Path | Findings, section: str) -> str:
 
 def rendered(found: Findings) -> str:
     """The page alone, without pictures of the worst places."""
-    content = summary(found, LIMIT)
+    content = summary(found, LIMIT) | {"files": [], "not_written": {}, "foxglove": None}
     return report_page(found, content, [View("not taken")] * 10, ["not drawn"] * 6)
 
 
@@ -354,9 +355,10 @@ def test_importances_name_their_forest(page: Path) -> None:
     text = text_of(page, "importances")
     used, papers = text.split("The paper's forest on 2 factors, by factor")
     assert "The model in use on 2 factors, by factor" in used
-    assert "vd_mean OB observability 0.750 ob_info_up" in used
+    meaning = CATALOGUE["vd_mean"].meaning
+    assert f"vd_mean {meaning} OB observability 0.750 ob_info_up" in used
     assert "OB observability 2 2.00 cm ± 0.30 cm" in used
-    assert "bhatt_sim LS local similarity 0.600 0.23" in papers
+    assert f"bhatt_sim {CATALOGUE['bhatt_sim'].meaning} LS local similarity 0.600 0.23" in papers
     assert "The paper's forest on 12 factors, by criterion, on held-out blocks" in papers
     assert "LS local similarity 4 1.20 cm ± 0.20 cm" in papers
 

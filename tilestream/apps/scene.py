@@ -20,15 +20,14 @@ from tilestream.errors import TileNotReadyError, UsageError
 from tilestream.grid import MM_PER_M, Box, TileKey
 from tilestream.pipeline.jobs.run_folder import map_of, rows_of
 from tilestream.records import Float64
-from tilestream.report.colours import FIXED
+from tilestream.report.colours import FIXED, greys, height_range
 from tilestream.store import TileStore
+from tilestream.thinned import thinned
 
 MOST_POINTS = 2_000_000
 """Map points that a view shows: what a laptop turns smoothly."""
-LOWEST, HIGHEST = np.array([0.22, 0.26, 0.31]), np.array([0.93, 0.95, 0.97])
-"""Colours of the heights, greys: the colours of errors must stand out."""
 TAILS = 0.02
-"""Share of the heights, and of the map's extent, that is left out at each end: strays."""
+"""Share of the map's extent that is left out at each end: strays."""
 SMALLEST, LARGEST, SHARE = 0.8, 5.0, 1 / 150
 """Radius of a place: at least and at most this [m], and between them this share of what is seen."""
 
@@ -57,15 +56,12 @@ class Scene:
     @cached_property
     def height_range(self) -> tuple[float, float]:
         """Heights at which the greys begin and end [m, map frame]."""
-        low, high = np.quantile(self.points[:, 2], (TAILS, 1.0 - TAILS))
-        return float(low + self.origin[2]), float(high + self.origin[2])
+        low, high = height_range(self.points[:, 2])
+        return low + float(self.origin[2]), high + float(self.origin[2])
 
     def point_rgb(self) -> Float64:
         """(n, 3) greys of the points by height, in [0, 1]."""
-        low, high = self.height_range
-        share = (self.points[:, 2] + self.origin[2] - low) / max(high - low, 1e-3)
-        rgb: Float64 = LOWEST + np.clip(share, 0.0, 1.0)[:, None] * (HIGHEST - LOWEST)
-        return rgb
+        return greys(self.points[:, 2] + self.origin[2], self.height_range)
 
     def place_rgb(self) -> Float64:
         """(k, 3) colours of the places by error as in reports, grey where none is known, in
@@ -124,8 +120,7 @@ def scene_of(
     store = map_of(place)
     tiles, counts = _tiles(store, tile)
     total, first = sum(counts), np.array(store.grid.origin_mm(tiles[0])) / MM_PER_M
-    shares = np.diff(np.cumsum([0, *counts]) * min(points, total) // total)
-    kept = np.concatenate([_thinned(store, *each) for each in zip(tiles, shares, strict=True)])
+    kept = thinned(store, dict(zip(tiles, counts, strict=True)), points)
     at, error, measured = route_of(place)
     if tile is not None:
         here = _inside(store.grid.core(tiles[0]), at)
@@ -148,14 +143,6 @@ def _tiles(store: TileStore, only: tuple[int, int] | None) -> tuple[tuple[TileKe
     if not filled:
         raise TileNotReadyError(f"{store.url}: no point to show; see `tilestream status`")
     return tuple(filled), list(filled.values())
-
-
-def _thinned(store: TileStore, key: TileKey, count: int) -> Float64:
-    """Some points of a tile, always the same."""
-    points = store.tile(key).points()
-    random = np.random.default_rng([abs(key.ix), abs(key.iy)])
-    kept: Float64 = points[np.sort(random.permutation(len(points))[:count])]
-    return kept
 
 
 def _inside(box: Box, at: Float64) -> NDArray[np.bool_]:

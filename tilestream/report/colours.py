@@ -30,6 +30,10 @@ CRITERION = {"FS": "#0072b2", "RQ": "#e69f00", "LY": "#009e73", "LS": "#cc79a7",
 OTHER = "#7f7f7f"
 CHOICES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", OTHER)
 """Of the choices that are compared, in turn."""
+LOWEST, HIGHEST = np.array([0.22, 0.26, 0.31]), np.array([0.93, 0.95, 0.97])
+"""Of the heights of a map in 3D, greys: the colours of errors must stand out."""
+TAILS = 0.02
+"""Share of the heights that is left out at each end of the greys: strays."""
 CLIP = 0.98
 """Quantile of the estimates at which the colours of a run's own range end: a few lost places must
 not hide the rest."""
@@ -89,3 +93,17 @@ def scale_of(error: Float64) -> Scale:
     high = high if high > low else low + 0.01
     edges = tuple(float(edge) for edge in MaxNLocator(STEPS).tick_values(low, high)[1:-1])
     return Scale(edges if len(edges) > 1 else (low, high))
+
+
+def height_range(z: Float64) -> tuple[float, float]:
+    """Heights at which the greys begin and end [m]."""
+    low, high = np.quantile(z, (TAILS, 1.0 - TAILS))
+    return float(low), float(high)
+
+
+def greys(z: Float64, span: tuple[float, float]) -> Float64:
+    """(n, 3) greys of heights, in [0, 1]: from the lower end of a span to the higher [m]."""
+    low, high = span
+    share = np.clip((z - low) / max(high - low, 1e-3), 0.0, 1.0)
+    rgb: Float64 = LOWEST + share[:, None] * (HIGHEST - LOWEST)
+    return rgb

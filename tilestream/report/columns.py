@@ -1,6 +1,11 @@
-"""What the columns of the page's tables mean, for people who have not read the definitions."""
+"""What columns mean: of the page's tables in plain words, of the places as the definitions say."""
 
+from tilestream.factors import catalogue, observability
+from tilestream.factors.rows import PLACE_COLUMNS
+from tilestream.model.features import SPREAD_ACROSS, SPREAD_ALONG, WEAK_ALONG
 from tilestream.model.figures import SEGMENT
+from tilestream.model.training import PREDICTION_COLUMNS
+from tilestream.report.measured import MEASURED_COLUMNS
 
 COLUMNS = {
     "estimate": "The mean 3D error that scan matching is expected to have there, over starts up to "
@@ -37,3 +42,17 @@ COLUMNS = {
     "sample points": "Places along the drive where errors are measured.",
 }
 """By what stands above the column."""
+CATALOGUE = {
+    column.name: column
+    for column in (
+        *PLACE_COLUMNS,
+        *catalogue.COLUMNS,
+        *MEASURED_COLUMNS,
+        WEAK_ALONG,
+        SPREAD_ALONG,
+        SPREAD_ACROSS,
+        *observability.COLUMNS,
+        *PREDICTION_COLUMNS,
+    )
+}
+"""What each column of the places means."""

@@ -9,6 +9,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from tilestream.errors import UsageError
+from tilestream.formats.routes import Lane
 from tilestream.from_above import FromAbove
 from tilestream.model.registry import DEFAULT
 from tilestream.model.training import PREDICTION_COLUMNS
@@ -30,6 +31,20 @@ Ends = Callable[[str, int], pd.DataFrame]
 """Where the starts of a group's sample point began and ended, as `starts_of` tells it."""
 Around = Callable[[float, float, float], Float64]
 """(n, 3) map points [m] within about `AROUND` of a place in the map frame."""
+MapPoints = Callable[[int], Float64]
+"""(n, 3) a fair sample [m] of at most so many points of the map beside the places."""
+
+
+@dataclass(frozen=True, eq=False)
+class LaneletMap:
+    """A Lanelet2 map whose lanes are routes of a run."""
+
+    file: str
+    """Where it is, on a disk."""
+    lanes: Callable[[], Sequence[tuple[str | None, Lane]]]
+    """Its lanes, each with the name that its route has in the run; None: it is none of its routes.
+    """
+
 
 Seen = Callable[[Float64, float], Float64]
 """(k, 3) what the lidar sees [m, map frame] from a place (3,) [m] with a heading [rad]."""
@@ -101,6 +116,11 @@ class Findings:
     pictures."""
     around: Around | None = None
     """The map round a place, for the pictures of the worst ones; None: no pictures."""
+    map_points: MapPoints | None = None
+    """The map in 3D, for the scene of Foxglove; None: the scene is without it."""
+
+    lanelet_maps: tuple[LaneletMap, ...] = ()
+    """The Lanelet2 maps whose lanes are among the routes, for copies with the estimates."""
 
     seen: Seen | None = None
     """What the virtual lidar sees at a place, for the same pictures; None: it did not look."""
@@ -114,6 +134,11 @@ class Findings:
     def digits(self) -> int | None:
         """With how many significant digits estimates are told; None: their worth is not known."""
         return None if self.worth is None else self.worth.digits
+
+    @property
+    def worth_told(self) -> str:
+        """What the estimates are worth as one line; empty: nobody has said it."""
+        return "" if self.worth is None else " ".join(self.worth.told)
 
     def __post_init__(self) -> None:
         predicted = tuple(column.name for column in PREDICTION_COLUMNS)

@@ -18,7 +18,7 @@ from tilestream.report import charts, evaluation, formatting
 from tilestream.report.city_map import city_map, map_shows_every
 from tilestream.report.clouds import packed, viewer
 from tilestream.report.colours import ACTUAL, CRITERION, HELD_OUT, OTHER
-from tilestream.report.columns import COLUMNS
+from tilestream.report.columns import CATALOGUE, COLUMNS
 from tilestream.report.comparison import QUANTILE, Comparison
 from tilestream.report.data import AROUND, Findings
 from tilestream.report.drives import EVALUATED
@@ -41,12 +41,16 @@ MOST_TILES = 60
 
 FILES = {
     "places.csv": "all places with their estimates and factors, for a spreadsheet",
-    "places.parquet": "the same as GeoParquet, for Python and GIS",
+    "places.gpkg": "places and stretches in the colours of this page, for QGIS",
+    "places.parquet": "all places with their estimates and factors as GeoParquet, for Python",
     "over_threshold.geojson": "stretches over the threshold, for a web map or GIS",
+    "over_threshold.qml": "the style of the same for QGIS",
     "map.pcd": "the places coloured by error, for a viewer of point clouds",
+    "foxglove.mcap": "map, route and worst places in 3D, for Foxglove and rviz",
     "report.json": "all figures of this page, for machines",
 }
-"""What lies beside the report."""
+"""What may lie beside the report."""
+LANELETS = "a Lanelet2 map of the routes whose lanelets carry the estimates as tags"
 COMPARE_FILES = {
     "compare.csv": "all places with the estimate of each choice",
     "compare.json": "all figures of this page, for machines",
@@ -74,6 +78,8 @@ def _environment() -> Environment:
     environment.filters["alike"] = alike
     environment.filters["base64"] = lambda data: base64.b64encode(data).decode("ascii")
     environment.filters["explained"] = COLUMNS.__getitem__
+    environment.filters["meaning"] = lambda name: CATALOGUE[name].meaning
+    environment.tests["factor"] = CATALOGUE.__contains__
     environment.tests["known"] = formatting.known
     environment.tests["explained"] = COLUMNS.__contains__
     environment.globals |= {"cm_span": formatting.cm_span, "evaluation": evaluation}
@@ -117,7 +123,7 @@ def report_page(
             for k, route in enumerate(profiles)
         ]
         + [charts.path_chart(found, path["path"], f"path-{k}") for k, path in enumerate(paths)],
-        FILES,
+        _files(content["files"]),
         scripts=("page.js", "enter.js", "cloud.js", "place.js", "choose.js"),
         later=[viewer()] if turning else [],
         limit=formatting.cm(content["threshold"], 0),
@@ -140,6 +146,12 @@ def report_page(
         heights={"around": AROUND, "low": -BELOW, "high": ABOVE, "ramp": heights_ramp()},
         parts=(AXES, STARTS),
     )
+
+
+def _files(written: Sequence[str]) -> dict[str, str]:
+    """What lies beside the page, and what it is for."""
+    known = {name: what for name, what in FILES.items() if name in (*written, "report.json")}
+    return known | {name: LANELETS for name in written if name not in FILES}
 
 
 def _entered(worst: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

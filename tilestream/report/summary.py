@@ -176,11 +176,13 @@ def segment(places: pd.DataFrame, rows: Int64) -> dict[str, Any]:
     error = measure_of(part)
     row = int(np.nanargmax(error.known))
     worst = part.iloc[row]
+    first = max(int(rows[0]) - 1, 0)  # the reach of a place ends at its neighbours
+    reach = reaches(places.iloc[first : int(rows[-1]) + 2])
     return {
         "route_id": str(worst["route_id"]),
         "begin": float(part["arc_length"].iloc[0]),
         "end": float(part["arc_length"].iloc[-1]),
-        "length": float(reaches(places)[rows].sum()),
+        "length": float(reach[rows - first].sum()),
         "places": len(part),
         "worst": float(error.known[row]),
         "worst_measured": bool(error.known[row] == error.measured[row]),

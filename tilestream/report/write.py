@@ -11,14 +11,9 @@ from tilestream.files import Files
 from tilestream.report import pictures
 from tilestream.report.comparison import Comparison
 from tilestream.report.data import Findings, estimates
-from tilestream.report.exports import (
-    write_cloud,
-    write_csv,
-    write_geojson,
-    write_geoparquet,
-    write_json,
-    write_text,
-)
+from tilestream.report.exports.geometry import crs_of
+from tilestream.report.exports.tables import write_csv, write_json, write_text
+from tilestream.report.exports.write import write_for_others
 from tilestream.report.page import comparison_page, report_page
 from tilestream.report.segments import check_threshold
 from tilestream.report.summary import plain, summary
@@ -37,9 +32,13 @@ def write_report(
 ) -> dict[str, Any]:
     """Write the page and the files beside it: each of them whole, or not there.
 
-    `index.html` (needs no network), `places.parquet` (GeoParquet), `places.csv`,
-    `over_threshold.geojson`, `map.pcd`, `report.json`, `figures/*.png`. Files of these names are
-    replaced; figures of an earlier report that this one lacks are removed.
+    `index.html` (needs no network), `places.parquet` (GeoParquet), `places.csv`, `places.gpkg`
+    (GeoPackage with styles for QGIS), `over_threshold.geojson` and its style for QGIS
+    `over_threshold.qml`, `map.pcd`, `foxglove.mcap`, `lanelets.osm` (where routes are lanes of a
+    Lanelet2 map; of a second one `lanelets-2.osm`), `report.json`, `figures/*.png`. Files of these
+    names are replaced; figures and Lanelet2 maps of an earlier report that this one lacks are
+    removed. A file for other programs that cannot be written costs only itself: `not_written` in
+    `report.json`, and the page, say why.
 
     Args:
         findings: what is reported.
@@ -54,13 +53,11 @@ def write_report(
         CrsError: a CRS that pyproj does not know.
     """
     check_threshold(threshold)
+    crs_of(findings.crs)  # refused before anything is written
     place = Files.at(folder)
     place.under("figures").make()
     content = summary(findings, threshold)
-    write_geoparquet(place.under("places.parquet"), findings)
-    write_geojson(place.under("over_threshold.geojson"), findings, threshold)
-    write_csv(place.under("places.csv"), findings.places)
-    content["not_in_cloud"] = write_cloud(place.under("map.pcd"), findings)
+    content |= write_for_others(place, findings, threshold, content["segments"])
     worst = [view_of(findings, place) for place in content["worst"]]
     ends = ends_of(findings, content["worst_measured"])
     content["figures"] = _write_figures(place.under("figures"), findings, worst, ends)

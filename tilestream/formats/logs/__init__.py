@@ -7,6 +7,7 @@ from pathlib import Path
 from tilestream.files import local_path
 from tilestream.formats.logs import mcap, ros_bags, rosbag2
 from tilestream.formats.logs.base import Recording
+from tilestream.formats.logs.mcap_scene import Cloud, Marker, write_scene
 from tilestream.formats.logs.mcap_write import write_log
 from tilestream.formats.logs.scan_log import ScanLog, with_poses
 from tilestream.formats.logs.selection import ScanSelection
@@ -20,7 +21,17 @@ from tilestream.formats.registry import (
 )
 from tilestream.settings import LogOptions
 
-__all__ = ["LOG_FORMATS", "ScanLog", "ScanSelection", "is_log", "open_log", "write_log"]
+__all__ = [
+    "LOG_FORMATS",
+    "Cloud",
+    "Marker",
+    "ScanLog",
+    "ScanSelection",
+    "is_log",
+    "open_log",
+    "write_log",
+    "write_scene",
+]
 
 LOG_FORMATS: tuple[Format[Recording], ...] = (
     mcap.FORMAT,

@@ -28,6 +28,9 @@ class Path3:
     """(n,) time of each point [s], where it was recorded."""
     notes: tuple[str, ...] = ()
     """What its reader noticed."""
+    lanelets: tuple[tuple[str, int], ...] = ()
+    """Of a lane the lanelets that it is joined of: the number of each, and where in `positions` it
+    begins."""
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import math
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 
 import numpy as np
 
@@ -68,7 +69,7 @@ def read_lanelet2(path: str) -> Sequence[Path3 | Lost]:
             lost.append(Lost(_id(relation), error))
     crs = None if nodes.metric else DEGREES
     paths = [
-        Path3("-".join(part.number for part in chain), _joined(chain), crs)
+        Path3("-".join(part.number for part in chain), _joined(chain), crs, lanelets=_begins(chain))
         for chain in _chains(lanelets)
     ]
     return [*paths, *lost]
@@ -215,6 +216,12 @@ def _joined(chain: list[_Lanelet]) -> Float64:
     """The centre lines one after the other, the shared points once."""
     first, *rest = chain
     return np.concatenate([first.centre, *(part.centre[1:] for part in rest)])
+
+
+def _begins(chain: list[_Lanelet]) -> tuple[tuple[str, int], ...]:
+    """The lanelets, and where in what is joined each begins: at the last point before it."""
+    ends = accumulate((len(part.centre) - 1 for part in chain), initial=0)
+    return tuple((part.number, end) for part, end in zip(chain, ends, strict=False))
 
 
 def _tags(element: ET.Element) -> dict[str, str]:

@@ -48,6 +48,7 @@ from tilestream.pipeline.jobs.run_inputs import (
     inputs_of,
     seen_otherwise,
 )
+from tilestream.pipeline.jobs.run_lanes import lanelet_maps_of
 from tilestream.pipeline.jobs.run_notes import (
     drives_measured,
     log_poses_told,
@@ -222,6 +223,7 @@ def _report(settings: RunSettings, inputs: Inputs, story: Story, book: Book) -> 
         lost_labels=lost_labels(known),
         cell_size=settings.cell_size,
         ends=lambda group, sample: starts_of(settings.out, sample, group),
+        lanelet_maps=lanelet_maps_of(settings, inputs),
     )
     text = json.dumps(plain(evaluation), indent=1, allow_nan=False)
     write_text(settings.folder.under("tables/evaluation.json"), text + "\n")

@@ -12,7 +12,7 @@ from tilestream.factors.along_route import WIDTH
 from tilestream.factors.heights import note_of_drive, notes_of_routes
 from tilestream.factors.scan_at import scan_at
 from tilestream.from_above import FromAbove, seen_from_above
-from tilestream.grid import MM_PER_M, Box
+from tilestream.grid import MM_PER_M, Box, TileKey
 from tilestream.model.dataset import POINTS_MIN, TARGETS, Dataset, nearest_along
 from tilestream.model.evaluation import (
     differences_by_protocol,
@@ -37,8 +37,9 @@ from tilestream.records import Float64
 from tilestream.report.data import AROUND, BESIDE, Findings, Seen
 from tilestream.report.measured import with_measured
 from tilestream.report.worth import Worth
-from tilestream.store import TileStore
+from tilestream.store import POINTS, TileStore
 from tilestream.tables import read_tables
+from tilestream.thinned import thinned
 
 PLACE = ["route_id", "sample"]
 MOST_PIXELS = 1_200_000
@@ -286,6 +287,7 @@ def findings_of(
         around=lambda x, y, _: points_around(store, x, y, AROUND),
         seen=_seen(done, store),
         above=_above(done, store, places),
+        map_points=lambda most: points_beside(done, store, most),
     )
     evaluation = {name: table.to_dict("records") for name, table in tables.items()}
     return gathered, evaluation | {"ceilings": ceiling_of, "worth": worth.plain()}
@@ -294,7 +296,7 @@ def findings_of(
 def _above(done: Done, store: TileStore, places: pd.DataFrame) -> FromAbove | None:
     """The map behind the places; None: of none of them is the position known."""
     at = places[["x", "y"]].dropna().to_numpy(np.float64)
-    tiles = [task.tile for task in done.outputs("above") if task.tile is not None]
+    tiles = _tiles_beside(done)
     if not len(at) or not tiles:
         return None
     return seen_from_above(store, tiles, Box.around(at, BESIDE), MOST_PIXELS)
@@ -307,6 +309,18 @@ def _seen(done: Done, store: TileStore) -> Seen | None:
         return None
     by = looked[0].takes["observing"]
     return lambda at, heading: scan_at(store, at, heading, by.sensor, by.seeing, AROUND)
+
+
+def _tiles_beside(done: Done) -> list[TileKey]:
+    """The tiles within about `BESIDE` of the places."""
+    return [task.tile for task in done.outputs("above") if task.tile is not None]
+
+
+def points_beside(done: Done, store: TileStore, most: int) -> Float64:
+    """A fair sample of at most so many points of the tiles beside the places, (n, 3) [m]."""
+    marks = store.marks(POINTS, _tiles_beside(done))
+    counts = {key: mark.facts["points"] for key, mark in marks.items() if mark.status == "done"}
+    return thinned(store, counts, most)
 
 
 def _worth(

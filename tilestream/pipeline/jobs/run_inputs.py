@@ -59,6 +59,8 @@ class Inputs:
     """The logs to measure on."""
     routes: tuple[Route, ...]
     """Where to estimate."""
+    route_files: tuple[str, ...] = ()
+    """The files that the routes are of."""
     notes: Notes = field(default_factory=dict)
     """What a reader of the results must know, by source."""
     failures: Mapping[str, str] = field(default_factory=dict)
@@ -123,7 +125,7 @@ def _inputs(
     """The files of a job, with what is to be told of its routes, which are of these files."""
     left_out = [f"{name} is left out: {reason}" for name, reason in read.failures.items()]
     told = noticed(notes, read.notes_of(files), {"routes": left_out})
-    return Inputs(sources, drives, read.routes, told, failures=read.failures)
+    return Inputs(sources, drives, read.routes, tuple(files), told, failures=read.failures)
 
 
 def _other_lidars(settings: RunSettings) -> list[str]:

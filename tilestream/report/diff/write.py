@@ -12,7 +12,7 @@ from tilestream.report.diff.data import Kind, MapDiff
 from tilestream.report.diff.gate import Verdict
 from tilestream.report.diff.page import diff_page
 from tilestream.report.diff.summary import diff_content
-from tilestream.report.exports import write_json, write_text
+from tilestream.report.exports.tables import write_json, write_text
 from tilestream.store import require_folder
 
 WGS84 = "EPSG:4326"

@@ -2,7 +2,7 @@
 
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,41 +10,18 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 from pyproj import CRS, Transformer
-from pyproj.exceptions import CRSError
 
-from tilestream.errors import CrsError
-from tilestream.factors import catalogue, observability
-from tilestream.factors.rows import PLACE_COLUMNS
 from tilestream.files import Files
 from tilestream.formats.points.pcd import write_pcd
-from tilestream.model.features import SPREAD_ACROSS, SPREAD_ALONG, WEAK_ALONG
-from tilestream.model.training import PREDICTION_COLUMNS
-from tilestream.records import Float64
+from tilestream.report.columns import CATALOGUE
 from tilestream.report.data import Findings, estimates
-from tilestream.report.measured import MEASURED_COLUMNS
+from tilestream.report.exports.geometry import crs_of, wkb_points
 from tilestream.report.segments import segments
-from tilestream.report.summary import plain, segment
+from tilestream.report.summary import plain
 
 GEOPARQUET = "1.1.0"
 FORMULA = ("=", "+", "-", "@", "\t", "\n")
 """What a spreadsheet takes for the begin of a formula."""
-POINT_Z = 1001
-"""ISO WKB code of a point with z."""
-_WKB = np.dtype([("order", "u1"), ("kind", "<u4"), ("xyz", "<f8", 3)])
-_CATALOGUE = {
-    column.name: column
-    for column in (
-        *PLACE_COLUMNS,
-        *catalogue.COLUMNS,
-        *MEASURED_COLUMNS,
-        WEAK_ALONG,
-        SPREAD_ALONG,
-        SPREAD_ACROSS,
-        *observability.COLUMNS,
-        *PREDICTION_COLUMNS,
-    )
-}
-"""What each column of the places means."""
 
 
 def write_text(file: Files, text: str) -> None:
@@ -85,7 +62,7 @@ def write_geoparquet(file: Files, found: Findings) -> None:
     """
     at = found.places[["x", "y", "z"]].to_numpy(np.float64)
     placed = np.isfinite(at).all(axis=1)
-    crs = _crs(found.crs)
+    crs = crs_of(found.crs)
     geometry = {
         "encoding": "WKB",
         "geometry_types": ["Point Z"],
@@ -98,28 +75,17 @@ def write_geoparquet(file: Files, found: Findings) -> None:
         geometry["bbox"] = bounds.tolist()
     geo = {"version": GEOPARQUET, "primary_column": "geometry", "columns": {"geometry": geometry}}
     table = pa.Table.from_pandas(found.places, preserve_index=False)
-    table = table.append_column("geometry", pa.array(_wkb(at, placed), pa.binary()))
+    table = table.append_column("geometry", pa.array(wkb_points(at), pa.binary()))
     about = {b"geo": json.dumps(geo).encode()}
-    about |= {b"worth": _worth(found).encode()} if found.worth else {}
+    about |= {b"worth": found.worth_told.encode()} if found.worth else {}
     schema = pa.schema([_documented(field) for field in table.schema], about)
     buffer = io.BytesIO()
     pq.write_table(table.cast(schema), buffer, compression="zstd")
     file.write(buffer.getvalue())
 
 
-def _worth(found: Findings) -> str:
-    """What the estimates are worth as one line; empty: nobody has said it."""
-    return "" if found.worth is None else " ".join(found.worth.told)
-
-
-def _wkb(at: Float64, placed: np.ndarray[Any, np.dtype[np.bool_]]) -> list[bytes | None]:
-    rows = np.zeros(len(at), _WKB)
-    rows["order"], rows["kind"], rows["xyz"] = 1, POINT_Z, at
-    return [row.tobytes() if good else None for row, good in zip(rows, placed, strict=True)]
-
-
 def _documented(field: pa.Field) -> pa.Field:
-    column = _CATALOGUE.get(field.name)
+    column = CATALOGUE.get(field.name)
     if column is None:
         return field
     return field.with_metadata(
@@ -127,22 +93,30 @@ def _documented(field: pa.Field) -> pa.Field:
     )
 
 
-def write_geojson(file: Files, found: Findings, threshold: float) -> None:
+def write_geojson(
+    file: Files, found: Findings, threshold: float, told: Sequence[Mapping[str, Any]]
+) -> None:
     """Write the segments over a threshold: lines, and points where one sample point stands alone.
 
     Positions are longitude and latitude, as GeoJSON wants; of a map without a CRS they are its
     metres, and the member `coordinates` of the collection says so.
 
+    Args:
+        file: where to.
+        found: what is reported.
+        threshold: estimates above this are too large [m].
+        told: what is told of each segment (`segments` of the summary).
+
     Raises:
         CrsError: a CRS that pyproj does not know.
     """
-    crs = _crs(found.crs)
+    crs = crs_of(found.crs)
     at = found.places[["x", "y", "z"]].to_numpy(np.float64).copy()
     if crs is not None:
         to_degrees = Transformer.from_crs(crs, CRS.from_epsg(4326), always_xy=True)
         at[:, 0], at[:, 1] = to_degrees.transform(at[:, 0], at[:, 1])
     features = []
-    for rows in segments(found.places, threshold):
+    for rows, properties in zip(segments(found.places, threshold), told, strict=True):
         positions = [
             [round(x, 9), round(y, 9)] + ([round(z, 3)] if np.isfinite(z) else [])
             for x, y, z in at[rows].tolist()
@@ -156,7 +130,7 @@ def write_geojson(file: Files, found: Findings, threshold: float) -> None:
         features.append(
             {
                 "type": "Feature",
-                "properties": segment(found.places, rows),
+                "properties": properties,
                 "geometry": geometry if positions else None,
             }
         )
@@ -166,17 +140,10 @@ def write_geojson(file: Files, found: Findings, threshold: float) -> None:
         "name": "over_threshold",
         "threshold": threshold,
         "coordinates": degrees if crs is not None else "map frame [m]; the map names no CRS",
-        **({"worth": _worth(found)} if found.worth else {}),
+        **({"worth": found.worth_told} if found.worth else {}),
         "features": features,
     }
     write_json(file, collection)
-
-
-def _crs(name: str | None) -> CRS | None:
-    try:
-        return None if name is None else CRS.from_user_input(name)
-    except CRSError as error:
-        raise CrsError(f"{name!r} is no CRS that pyproj knows ({error})") from error
 
 
 def write_cloud(file: Files, found: Findings) -> int:
@@ -196,6 +163,6 @@ def write_cloud(file: Files, found: Findings) -> int:
         "estimate": estimate[placed].astype(np.float32),
     }
     write_pcd(
-        file.address, at[placed], fields=fields, comments=[_worth(found)] if found.worth else []
+        file.address, at[placed], fields=fields, comments=[found.worth_told] if found.worth else []
     )
     return int((~placed).sum())
