@@ -176,7 +176,8 @@ def _in_order(table: pd.DataFrame) -> pd.DataFrame:
     if not keys or table.empty:
         return table.reset_index(drop=True)
     keys = ["route_id", "sample"] if "route_id" in table else ["path", "arc_length", "group"]
-    return table.sort_values(keys, kind="stable").reset_index(drop=True)
+    # a copy lies in one piece, whatever columns were added one by one
+    return table.sort_values(keys, kind="stable").reset_index(drop=True).copy()
 
 
 def estimates(places: pd.DataFrame) -> Float64:
