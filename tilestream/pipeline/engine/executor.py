@@ -22,6 +22,9 @@ Watch = Callable[[Outcome, int, int], None]
 (in what the stage counts: tiles, scans, points)."""
 Grow = Callable[[Outcome], Iterable[Task]]
 """Called after each task: what is to be done besides, now that its outcome is known."""
+Ahead = Callable[[], Sequence[Task] | None]
+"""Called as the plan grows: tasks that it will have in the end, those that it has among them or
+not; None: not known yet. An answer that has not changed is the same object."""
 
 
 def execute(
@@ -30,6 +33,7 @@ def execute(
     watch: Watch | None,
     *,
     grow: Grow | None = None,
+    ahead: Ahead | None = None,
     shared: Sequence[str] = (),
     inputs: Sequence[str] = (),
     retries: int = RETRIES,
@@ -47,6 +51,7 @@ def execute(
             None: one by one in this process.
         watch: is told of each outcome.
         grow: adds tasks to the plan while it runs.
+        ahead: tells what it will have added in the end, for the time left on the dashboard.
         shared: folders and stores that all workers must see, also those that come later.
         inputs: files that they all must see.
         retries: how often a task is tried again.
@@ -60,7 +65,7 @@ def execute(
         TaskError: the scheduler was lost, or has had no worker for too long. What is done is
             marked: the same command continues.
     """
-    run = _Run(plan.tasks, watch, grow, Frontier(retries))
+    run = _Run(plan.tasks, watch, grow, ahead, Frontier(retries))
     if client is None:
         run.hear(_run_here(run.frontier, plan.memory))
         return run.outcomes
@@ -73,7 +78,7 @@ def execute(
     names = DaskNames()
     require_blocking(client)
     meet = partial(require_seen, client, shared, inputs)
-    with dashboard_client(client, names) as page:
+    with dashboard_client(client, names, shared) as page:
         run.show(page)
         run.hear(run_on_dask(run.frontier, client, names, plan.memory, patience, meet))
     return run.outcomes
@@ -87,10 +92,12 @@ class _Run:
         tasks: Iterable[Task],
         watch: Watch | None,
         grow: Grow | None,
+        ahead: Ahead | None,
         frontier: Frontier,
     ) -> None:
         self.frontier = frontier
         self._watch, self._grow = watch, grow
+        self._ahead: Ahead = ahead or (lambda: None if grow else ())
         self._page: DashboardClient | None = None
         self._tasks: dict[str, Task] = {}
         self._ended: dict[str, Outcome] = {}
@@ -107,8 +114,9 @@ class _Run:
         """From now on, tell a page what it is told here; first, what has been so far."""
         self._page = page
         page.plan(list(self._tasks.values()))
+        page.expect(self._ahead())
         for outcome in self._ended.values():
-            page.learn(outcome)
+            page.learn(outcome, self._tasks[outcome.key])
 
     def hear(self, outcomes: Iterable[Outcome]) -> None:
         """Take outcomes as they come, and add the tasks that they lead to."""
@@ -116,7 +124,7 @@ class _Run:
             self._ended[outcome.key] = outcome
             self._done[outcome.stage] += self._tasks[outcome.key].work
             if self._page is not None:
-                self._page.learn(outcome)
+                self._page.learn(outcome, self._tasks[outcome.key])
             if self._watch is not None:
                 self._watch(outcome, self._done[outcome.stage], self._total[outcome.stage])
             if self._grow is not None:
@@ -130,6 +138,7 @@ class _Run:
             self._total[task.stage] += task.work
         if self._page is not None and more:
             self._page.plan(more)
+            self._page.expect(self._ahead())
 
 
 def _run_here(frontier: Frontier, memory: int) -> Iterator[Outcome]:

@@ -94,6 +94,7 @@ def ingest(
             client,
             watch,
             grow=lambda outcome: reading.grown(outcome) or (),
+            ahead=lambda: () if reading.sorted_out or reading.current else None,
             shared=[reading.store.url],
             inputs=reading.inputs,
         )

@@ -131,6 +131,7 @@ def _run(
                 client,
                 book.listening(watch),
                 grow=story.grown,
+                ahead=story.ahead,
                 shared=[settings.out, story.store.url],
                 inputs=story.files,
             )

@@ -1,11 +1,13 @@
 """The main job as it goes on: what is known after each part decides what the next one is."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
 import joblib
 
+from tilestream.errors import PlanError
 from tilestream.files import Files
 from tilestream.model.shipped import SHIPPED
 from tilestream.notes import noticed
@@ -65,6 +67,7 @@ class Story:
         self._given: set[str] = set()
         self._joining: str | None = None
         self._all_planned = False
+        self._ahead: tuple[Task, ...] | None = None
 
     @property
     def places(self) -> int:
@@ -113,6 +116,13 @@ class Story:
             return self._known(early)
         return self._known(self._estimated())
 
+    def ahead(self) -> tuple[Task, ...] | None:
+        """What is expected to follow what is measured; None: that is not known yet."""
+        if self._ahead is None and self.measure.tasks:
+            with suppress(PlanError):  # raised when it comes to that, if it does
+                self._ahead = self._expected().tasks
+        return self._ahead
+
     def _estimated(self) -> tuple[Task, ...]:
         """What is to be done when all is measured."""
         labels = {task.key: task.work for task in self.measure.outputs("label")}
@@ -136,7 +146,7 @@ class Story:
     def _rest(self, planned: Plan) -> tuple[Task, ...]:
         """What of the whole plan has not been given out."""
         announce(planned.tasks, begun=bool(self._given))
-        self._all_planned = True
+        self._all_planned, self._ahead = True, ()
         if self.estimator.few:
             self.book.failures[LABELS] = self.estimator.few
         tasks = tuple(task for task in planned.tasks if task.key not in self._given)
@@ -144,6 +154,10 @@ class Story:
             self.large = Plan(self._known(tasks), planned.memory)
             return ()
         return tasks
+
+    def _expected(self) -> Plan:
+        """What is learnt and estimated if all is measured well."""
+        return self._plan([Outcome(task.key, task.stage) for task in self.measure.tasks])
 
     def _plan(self, outcomes: Sequence[Outcome]) -> Plan:
         """What is learnt and estimated from what was measured."""
@@ -176,8 +190,7 @@ class Story:
         self.estimator = estimator_of(self.settings, labelled)
         if self.estimator.trained:
             return _Early((), set())
-        planned = self._plan([Outcome(task.key, task.stage) for task in self.measure.tasks])
-        tasks = planned.outputs("predict")
+        tasks = self._expected().outputs("predict")
         announce(tasks)
         return _Early(tasks, self._open)
 
