@@ -51,6 +51,7 @@ OF_A_FINISHED_RUN = (
     "drive_estimate.py drive",
     "experiment.py city",
     "over_runs.py retrained --competitors physics",
+    "page.py city --places 20",
     "predict.py --run city",
     "virtual_drive.py city city --every 20",
 )
