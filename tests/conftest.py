@@ -1,6 +1,5 @@
 """Fixtures that all tests share."""
 
-import fcntl
 import os
 import socket
 import subprocess
@@ -58,30 +57,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.path.name in order:
             item.add_marker(pytest.mark.long)
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _each_kernel_is_compiled_once(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Of two processes that need a kernel at the same time, one waits for the other's cache."""
-    numba = import_module("numba.core.dispatcher")
-    compiled_alone = numba.Dispatcher.compile
-    base = tmp_path_factory.getbasetemp()
-    folder = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
-    held: set[str] = set()
-
-    def compiled(kernel: Any, signature: Any) -> Any:
-        name = f"{kernel.py_func.__module__}.{kernel.py_func.__qualname__}"
-        if name in held or not name.startswith("tilestream."):  # Numba's own may call each other
-            return compiled_alone(kernel, signature)
-        with numba.global_compiler_lock, (folder / f"{name}.lock").open("w") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
-            held.add(name)
-            try:
-                return compiled_alone(kernel, signature)
-            finally:
-                held.remove(name)
-
-    numba.Dispatcher.compile = compiled
 
 
 def shared(name: str, variable: str, what: str) -> Path:

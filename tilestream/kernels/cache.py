@@ -115,6 +115,8 @@ def _settle() -> bool:
 
 _KEPT = _settle()
 """Whether compiled kernels are kept."""
+_HELD: set[Path] = set()
+"""The locks of kernels that this process compiles now."""
 
 
 def njit(**options: Any) -> Decorator:
@@ -143,7 +145,7 @@ def njit(**options: Any) -> Decorator:
 @contextmanager
 def _alone(lock: Path) -> Iterator[None]:
     """Be the only process in here; where a file cannot be locked, one of several."""
-    if sys.platform == "win32":
+    if sys.platform == "win32" or lock in _HELD:  # a kernel that calls itself compiles inside
         yield
         return
     try:
@@ -154,6 +156,8 @@ def _alone(lock: Path) -> Iterator[None]:
         return
     try:
         fcntl.flock(file, fcntl.LOCK_EX)
+        _HELD.add(lock)
         yield
     finally:
+        _HELD.discard(lock)
         os.close(file)

@@ -193,14 +193,13 @@ def _columns(found: Findings, rows: Int64, origin: Float64) -> dict[str, Any]:
     part, digits = found.places.iloc[rows], found.digits
     estimate = estimates(part)
     step = found.scale.step(estimate)
-    share = np.clip(step, 0, None) / (len(found.scale.colours) - 1)
     figures = part[["low", "high", "p_fail", *AXES, *STARTS]].to_dict("records")
     return {
         "x": part["x"].to_numpy(np.float64) - origin[0],
         "y": part["y"].to_numpy(np.float64) - origin[1],
         "estimate": estimate * CM_PER_M,
         "step": step + 0.5,
-        "size": 5.0 + 7.0 * share,
+        "size": _size(found.scale, estimate),
         "route": part["route_id"].astype(str).tolist(),
         "arc": part["arc_length"].to_numpy(np.float64),
         "shown": [
@@ -216,6 +215,12 @@ def _columns(found: Findings, rows: Int64, origin: Float64) -> dict[str, Any]:
     }
 
 
+def _size(scale: Scale, error: Float64) -> Float64:
+    """(n,) diameters of marks [pixels]: larger errors stand out, as in the paper's Fig. 2."""
+    size: Float64 = 5.0 + 7.0 * np.clip(scale.step(error), 0, None) / (len(scale.colours) - 1)
+    return size
+
+
 def _draw_measured(plot: figure, found: Findings, origin: Float64, how: tuple[str, Any]) -> None:
     """Squares in the colour of the error that was measured there, on top of the estimates."""
     tip, mapper = how
@@ -229,9 +234,10 @@ def _draw_measured(plot: figure, found: Findings, origin: Float64, how: tuple[st
     columns = _columns(found, rows, origin)
     columns["measured"] = measured[rows] * CM_PER_M
     columns["step"] = found.scale.step(measured[rows]) + 0.5
+    columns["size"] = _size(found.scale, measured[rows])
     source = ColumnDataSource(columns, name="measured")
     style: dict[str, Any] = {"fill_color": {"field": "step", "transform": mapper}}
-    style |= {"marker": "square", "size": 9, "line_color": "black", "legend_label": "measured"}
+    style |= {"marker": "square", "size": "size", "line_color": "black", "legend_label": "measured"}
     style["view"] = _choosable()
     glyphs = plot.scatter("x", "y", source=source, **style)
     plot.add_tools(hover(glyphs, tip, sort_by=[("measured", -1)]))
