@@ -16,7 +16,7 @@ Told = pytest.CaptureFixture[str]
 LENGTHS = {"kitti_drive": 71.5, "kitti_0009": 55.0, "kitti_04": 69.2}
 """How far each drive leads [m], to a tenth of it; the lidar is mounted at 1.73 m."""
 HEIGHT = ["--sensor-height", "1.73"]
-MADE_OF_NOTHING = {"simulate", "demo", "template", "explain", "view"}
+MADE_OF_NOTHING = {"simulate", "demo", "template", "explain", "view", "warm"}
 """Commands that read no map and no drive, and the one that needs a display."""
 
 

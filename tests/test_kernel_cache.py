@@ -261,3 +261,56 @@ def test_a_process_that_is_killed_while_it_compiles_stops_nobody(
     assert installation.start(killed) == ([], [])
     assert list(installation.pycache.glob("*.lock"))
     assert installation.start() == ([str(installation.pycache), "0"], [])
+
+
+NOTHING_LEFT = """
+import sys, tempfile
+import numba.core.event as event
+from tilestream.apps.warm import SMALLEST, warm
+from tilestream.pipeline.jobs.run import run
+from tilestream.pipeline.jobs.run_settings import RunSettings
+
+class Listener(event.Listener):
+    def __init__(self):
+        self.names = []
+    def on_start(self, started):
+        kernel = started.data["dispatcher"].py_func
+        if kernel.__module__.startswith("tilestream."):
+            self.names.append(kernel.__name__)
+    def on_end(self, ended):
+        pass
+
+heard = Listener()
+event.register("numba:compile", heard)
+if sys.argv[1] == "warm":
+    print(warm())
+else:
+    model = {"use": "shipped"}
+    with tempfile.TemporaryDirectory() as folder:
+        settings = {"out": folder, **SMALLEST, "model": model, "observe": {"range_max": 30.0}}
+        run(RunSettings.model_validate(settings))
+print(len(heard.names), *heard.names)
+"""
+
+
+@posix
+@pytest.mark.slow
+def test_after_warm_no_job_compiles(tmp_path: Path) -> None:
+    cache = tmp_path / "kernels"
+    script = tmp_path / "program.py"
+    script.write_text(NOTHING_LEFT)
+    told = {}
+    for what in ("warm", "run"):
+        ran = subprocess.run(
+            [sys.executable, str(script), what],
+            env={**os.environ, "NUMBA_CACHE_DIR": str(cache)},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert ran.returncode == 0, ran.stderr
+        told[what] = ran.stdout.splitlines()
+    folder, compiled = told["warm"]
+    assert Path(folder).parent == cache
+    assert int(compiled.split()[0]) > 50
+    assert told["run"][-1].split() == ["0"]

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from tilestream.apps.verbs import demo, plan, simulate, status, template
     from tilestream.apps.verify import repair, verify
     from tilestream.apps.view import view
+    from tilestream.apps.warm import warm
     from tilestream.cli.progress import progress
     from tilestream.definitions import explain
     from tilestream.factors.observability import observability
@@ -122,6 +123,7 @@ __all__ = [
     "train_over",
     "verify",
     "view",
+    "warm",
 ]
 
 _LATE = {
@@ -132,6 +134,7 @@ _LATE = {
     "apps.verbs": ("demo", "plan", "simulate", "status", "template"),
     "apps.verify": ("repair", "verify"),
     "apps.view": ("view",),
+    "apps.warm": ("warm",),
     "cli.progress": ("progress",),
     "definitions": ("explain",),
     "factors.observability": ("observability",),

@@ -89,6 +89,10 @@ COMMANDS = {
         "viewing",
         "Show a map in 3D, the route on it coloured by measured or estimated error.",
     ),
+    "warm": (
+        "jobs",
+        "Compile the kernels that jobs need: once per installation, for an image or a first job.",
+    ),
     "demo": (
         "jobs",
         "A street of Shinjuku from its map alone, and what a drive measures: minutes, no files.",

@@ -9,6 +9,7 @@ import typer
 
 from tilestream.apps import diff as map_diff
 from tilestream.apps import verbs
+from tilestream.apps.warm import warm as compile_kernels
 from tilestream.cli.cluster import ALL_CORES, HERE, AllCores, Cluster, on_cluster
 from tilestream.cli.fields import fields, options_named, with_settings
 from tilestream.cli.options import AsJson, Changes, Config, DryRun
@@ -310,3 +311,11 @@ def demo(
 ) -> None:
     """A street of Shinjuku from its map alone, and what a drive measures: minutes, no files."""
     show_report(do_job(verbs.demo_settings(folder), Cluster(workers=workers)))
+
+
+def warm() -> None:
+    """Compile the kernels that jobs need: once per installation, for an image or a first job."""
+    out.print("Compiling, once per installation: about a minute of one core.", highlight=False)
+    folder = compile_kernels()
+    told = f"The kernels are kept in {folder}" if folder else "No folder is safe to keep them in"
+    out.print(told, soft_wrap=True, highlight=False)

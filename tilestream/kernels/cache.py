@@ -119,6 +119,11 @@ _HELD: set[Path] = set()
 """The locks of kernels that this process compiles now."""
 
 
+def kept_in() -> Path | None:
+    """The folder of the compiled kernels; None: every process compiles them anew."""
+    return _of_numba() if _KEPT else None
+
+
 def njit(**options: Any) -> Decorator:
     """Numba's decorator for every kernel of this package; one process compiles it at a time, the
     next finds it on disk.
