@@ -9,13 +9,12 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
-from pyproj import CRS, Transformer
 
 from tilestream.files import Files
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.report.columns import CATALOGUE
 from tilestream.report.data import Findings, estimates
-from tilestream.report.exports.geometry import crs_of, wkb_points
+from tilestream.report.exports.geometry import crs_of, geojson, wkb_points
 from tilestream.report.segments import segments
 from tilestream.report.summary import plain
 
@@ -98,8 +97,7 @@ def write_geojson(
 ) -> None:
     """Write the segments over a threshold: lines, and points where one sample point stands alone.
 
-    Positions are longitude and latitude, as GeoJSON wants; of a map without a CRS they are its
-    metres, and the member `coordinates` of the collection says so.
+    Positions as `geojson` has them.
 
     Args:
         file: where to.
@@ -110,40 +108,11 @@ def write_geojson(
     Raises:
         CrsError: a CRS that pyproj does not know.
     """
+    told_of = zip(segments(found.places, threshold), told, strict=True)
+    at = found.places[["x", "y", "z"]].to_numpy(np.float64)
+    worth = {"worth": found.worth_told} if found.worth else {}
     crs = crs_of(found.crs)
-    at = found.places[["x", "y", "z"]].to_numpy(np.float64).copy()
-    if crs is not None:
-        to_degrees = Transformer.from_crs(crs, CRS.from_epsg(4326), always_xy=True)
-        at[:, 0], at[:, 1] = to_degrees.transform(at[:, 0], at[:, 1])
-    features = []
-    for rows, properties in zip(segments(found.places, threshold), told, strict=True):
-        positions = [
-            [round(x, 9), round(y, 9)] + ([round(z, 3)] if np.isfinite(z) else [])
-            for x, y, z in at[rows].tolist()
-            if np.isfinite([x, y]).all()
-        ]
-        single = len(positions) == 1
-        geometry = {
-            "type": "Point" if single else "LineString",
-            "coordinates": positions[0] if single else positions,
-        }
-        features.append(
-            {
-                "type": "Feature",
-                "properties": properties,
-                "geometry": geometry if positions else None,
-            }
-        )
-    degrees = "longitude, latitude (WGS 84); z as in the map [m]"
-    collection = {
-        "type": "FeatureCollection",
-        "name": "over_threshold",
-        "threshold": threshold,
-        "coordinates": degrees if crs is not None else "map frame [m]; the map names no CRS",
-        **({"worth": found.worth_told} if found.worth else {}),
-        "features": features,
-    }
-    write_json(file, collection)
+    write_json(file, geojson("over_threshold", at, crs, told_of, threshold=threshold, **worth))
 
 
 def write_cloud(file: Files, found: Findings) -> int:
