@@ -156,6 +156,7 @@ USES: list[tuple[str, int, str]] = [
     # names
     ("explain rangemax", 2, "'rangemax', range_max"),
     ("template job.yaml", 2, "job.yaml, template --help"),
+    ("warm map.zarr", 2, "map.zarr, warm --help"),
     # jobs
     ("run gone.yaml", 2, "gone.yaml, tilestream template"),
     ("run empty", 2, "empty, a directory, tilestream template"),
