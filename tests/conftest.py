@@ -19,35 +19,54 @@ settings.load_profile("calm")
 
 LONG = (
     "registration",  # compiles half of the kernels
-    "run",  # compiles none meanwhile
     "factors_against_literal",  # compiles the other half
     "main_job",
-    "simulation_run",
-    "vicinity",
-    "ingest",
-    "fuzz",
+    "map_update",
     "cli",
-    "scale",
     "dashboard",
+    "estimate",
+    "simulation_run",
+    "places_entered",
     "report",
-    "view",
-    "observe_route",
-    "model_evaluation",
-    "model_regressors",
-    "interpreted",
-    "model_file",
+    "ingest",
+    "stored",
     "report_page",
+    "over_runs",
+    "places",
+    "model_physics",
+    "run",
+    "one_bad_thing",
+    "surroundings",
+    "kernel_cache",
+    "scale",
+    "fuzz",
+    "memory",
+    "map_diff",
+    "model_intervals",
+    "notes",
+    "model_file",
+    "model_regressors",
     "readme",
-    "cases_route",
-    "log_frames",
-    "rosbag2",
-    "store",
-    "factors_route",
     "localize_drive",
     "compare",
+    "info",
+    "store",
+    "diff_page",
+    "ghosts",
+    "observe_route",
+    "matcher_file",
+    "completion",
+    "cases_route",
+    "factors_route",
+    "model_figures",
+    "model_evaluation",
+    "starts_of",
+    "pairs",
+    "degraded_drives",
 )
 """Files of ten seconds and more, the longest first: what is begun last must be short, or one of
-the processes that the tests run in would wait for another."""
+the processes that the tests run in would wait for another. By default they are left out, so that
+tests take three minutes; `-m long` runs them, as CI does."""
 
 
 @pytest.hookimpl(tryfirst=True)  # before -m looks at the marks
