@@ -314,3 +314,16 @@ def test_after_warm_no_job_compiles(tmp_path: Path) -> None:
     assert Path(folder).parent == cache
     assert int(compiled.split()[0]) > 50
     assert told["run"][-1].split() == ["0"]
+
+
+@posix
+def test_a_file_system_without_locks_stops_nobody(installation: Installation) -> None:
+    unlocked = SUMS.replace(
+        "one, out",
+        "import fcntl\n"
+        "def refused(*_): raise OSError('no locks available')\n"
+        "fcntl.flock = refused\n"
+        "one, out",
+        1,
+    )
+    assert installation.start(unlocked) == ([str(installation.pycache), "0"], [])
