@@ -189,15 +189,24 @@ def test_with_all_starts_it_is_the_label_of_the_virtual_scan(store: ts.TileStore
     held = np.sort(label.error[label.error <= 0.5])
     assert held[(len(held) - 1) // 2] <= found["vd_median"] <= held[len(held) // 2]
     near = np.hypot(*(label.T_map_lidar_starts[:, :2, 3] - T[:2, 3]).T) <= 1.0 + 1e-9
-    assert found["vd_near_across"] == pytest.approx(label.across[near].mean(), abs=1e-12)
-    product_of = (label.along * label.up)[near].mean()
+    core = near & (label.error <= 0.5)
+    assert 0.0 < found["vd_near_p_fail"] < 1.0
+    assert found["vd_near_p_fail"] == pytest.approx(1.0 - core.sum() / near.sum(), abs=1e-12)
+    assert found["vd_near_across"] == pytest.approx(label.across[core].mean(), abs=1e-12)
+    product_of = (label.along * label.up)[core].mean()
     assert found["vd_near_along_up"] == pytest.approx(product_of, abs=1e-12)
+    ends_at = label.registrations
+    assert found["vd_near_tp"] == pytest.approx(ends_at.score[core].mean() / ends_at.points)
+    nvtl = (ends_at.nvtl / ends_at.hits)[core] * ends_at.points
+    assert found["vd_near_nvtl"] == pytest.approx(nvtl.mean())
+    assert found["vd_near_nvtl_sd"] == pytest.approx(nvtl.std())
 
 
 def ends(seed: int, count: int = 32) -> Ends:
     """A draw whose registrations end anywhere."""
-    axes = np.random.default_rng(seed).normal(0.0, 0.2, (count, 6))
-    return Ends(stratified_starts(count, seed), np.linalg.norm(axes[:, :3], axis=1), axes)
+    rng = np.random.default_rng(seed)
+    axes, scores = rng.normal(0.0, 0.2, (count, 6)), rng.uniform(1.0, 3.0, (2, count))
+    return Ends(stratified_starts(count, seed), np.linalg.norm(axes[:, :3], axis=1), axes, *scores)
 
 
 def test_a_place_is_the_mean_of_its_draws_and_tells_their_spread() -> None:
@@ -212,19 +221,25 @@ def test_a_place_is_the_mean_of_its_draws_and_tells_their_spread() -> None:
     assert set(found) == {column.name for column in VIRTUAL}
 
 
-def test_the_moments_are_those_of_all_starts_of_a_ring() -> None:
+def test_the_moments_are_those_of_the_starts_of_a_ring_that_hold() -> None:
     draws = [ends(k) for k in range(3)]
     found = virtual_drive(draws)
     axes = np.vstack([one.axes for one in draws])
     ring = np.concatenate([one.starts.ring for one in draws])
+    held = np.concatenate([one.error for one in draws]) <= 0.5
+    assert 0 < held.sum() < len(held)
     for number, name in enumerate(RINGS):
+        here = (ring == number) & held
+        assert found[f"vd_{name}_p_fail"] == pytest.approx(
+            1.0 - here.sum() / (ring == number).sum()
+        )
         mean = np.array([found[f"vd_{name}_{axis}"] for axis in AXES])
-        np.testing.assert_allclose(mean, axes[ring == number].mean(axis=0))
+        np.testing.assert_allclose(mean, axes[here].mean(axis=0))
         second = np.zeros((6, 6))
         for (i, a), (j, b) in combinations_with_replacement(enumerate(AXES), 2):
             second[i, j] = second[j, i] = found[f"vd_{name}_{a}_{b}"]
         covariance = second - np.outer(mean, mean)
-        np.testing.assert_allclose(covariance, np.cov(axes[ring == number].T, ddof=0), atol=1e-12)
+        np.testing.assert_allclose(covariance, np.cov(axes[here].T, ddof=0), atol=1e-12)
 
 
 def test_a_weighted_median_has_half_of_the_weight_on_each_side() -> None:

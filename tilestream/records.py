@@ -240,6 +240,8 @@ Criterion = Literal["FS", "RQ", "LY", "LS", "OB", "place", "label"]
 """FS feature sufficiency, RQ representation quality, LY layout, LS local similarity (the paper,
 section V), OB observability; `place`: which row it is; `label`: what was measured or estimated
 there."""
+FactorSet = Literal["faithful", "robust", "observability", "own"]
+"""The paper's own factors, or others (`Column.factor_set`)."""
 
 
 @dataclass(frozen=True)
@@ -256,7 +258,7 @@ class Column:
     """What it says, in a sentence or two."""
     source: str
     """The formula, and where it comes from: `eq. 4`, `definitions, section 4`, …"""
-    factor_set: Literal["faithful", "robust", "observability", "own"] = "faithful"
+    factor_set: FactorSet = "faithful"
     """The paper's own, or a twin that is not degenerate (definitions, section 3 and
     definitions, section 4); `own`: of a file of the user's (`factors/own.py`)."""
     dtype: str = "float64"

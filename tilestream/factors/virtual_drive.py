@@ -5,7 +5,6 @@ sample point, spread and weighted so that they represent the whole disc. Where a
 is random to a degree, so several scans are registered, each from other starts: the draws.
 """
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,14 +15,21 @@ import pandas as pd
 from tilestream.label import FAILED, disc_starts, start_errors
 from tilestream.local_map import LocalCells
 from tilestream.matcher import RegistrationSettings
+from tilestream.moments import (
+    AXES,
+    autoware_scores,
+    moment_columns,
+    moments_of,
+    score_columns,
+    scores_of,
+)
 from tilestream.records import Cells, Column, Criterion, Float64, Int64
 from tilestream.registration import register
 
 RINGS = {"near": (0.0, 0.5, 1 / 4), "middle": (0.5, 0.75, 1 / 4), "far": (0.75, 1.0, 1 / 2)}
 """Rings of the disc of starts: inner and outer radius as shares of the disc's, and share of the
 starts of a draw. The near one, within 1.0 m, makes the floor; far starts decide the tail."""
-AXES = ("along", "across", "up", "roll", "pitch", "yaw_vector")
-"""The six signed errors of a start (`start_errors`)."""
+SOURCE = "definitions, section 4.5"
 GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 """Turn from one start to the next, so that any number of them is spread evenly [rad]; half of it
 from the starts of one draw to those of the next."""
@@ -33,7 +39,7 @@ def _column(
     name: str,
     unit: str,
     meaning: str,
-    source: str = "definitions, section 4.5",
+    source: str = SOURCE,
     kind: Criterion = "OB",
 ) -> Column:
     return Column(name, kind, unit, meaning, source, "observability")
@@ -60,27 +66,17 @@ SPREAD_COLUMNS = tuple(
 )
 MOMENT_COLUMNS = (
     *(
-        _column(
-            f"vd_{ring}_{axis}",
-            "m" if axis in AXES[:3] else "rad",
-            f"Mean signed error in {axis} of the starts of the {ring} ring, all draws.",
-            kind="place",
-        )
+        column
         for ring in RINGS
-        for axis in AXES
+        for column in moment_columns(
+            f"vd_{ring}", f"starts of the {ring} ring, all draws,", "place", SOURCE, "observability"
+        )
     ),
-    *(
-        _column(
-            f"vd_{ring}_{a}_{b}",
-            ("m^2", "m rad", "rad^2")[(a not in AXES[:3]) + (b not in AXES[:3])],
-            f"Mean of {a} times {b} of the same starts.",
-            kind="place",
-        )
-        for ring in RINGS
-        for a, b in itertools.combinations_with_replacement(AXES, 2)
+    *score_columns(
+        "vd_near", "starts of the near ring, all draws,", "place", SOURCE, "observability"
     ),
 )
-"""First and second moments of the errors, ring by ring: a covariance can be made of them."""
+"""Moments of the errors ring by ring, and scores: what a covariance is made of."""
 COLUMNS = (
     *PART_COLUMNS,
     _column("vd_median", "m", "Median 3D error of those that do not fail. NaN: there are none."),
@@ -142,6 +138,10 @@ class Ends:
     """(k,) 3D errors [m]."""
     axes: Float64
     """(k, 6) signed errors, `AXES` [m, rad]."""
+    nvtl: Float64
+    """(k,) NVTL at the end, as Autoware says it."""
+    tp: Float64
+    """(k,) transform probability at the end."""
 
 
 def ends_of(
@@ -165,9 +165,10 @@ def ends_of(
     """
     poses = np.repeat(T_map_lidar[None], len(starts.offset), axis=0)
     poses[:, :2, 3] += starts.offset
-    ends = register(cells, points, poses, settings).T_map_lidar
-    errors = start_errors(T_map_lidar, ends)
-    return Ends(starts, errors["error"], np.column_stack([errors[axis] for axis in AXES]))
+    found = register(cells, points, poses, settings)
+    errors = start_errors(T_map_lidar, found.T_map_lidar)
+    axes = np.column_stack([errors[axis] for axis in AXES])
+    return Ends(starts, errors["error"], axes, *autoware_scores(found))
 
 
 def virtual_drive(drives: Sequence[Ends]) -> dict[str, float]:
@@ -205,15 +206,17 @@ def _parts(ends: Ends) -> dict[str, float]:
 def _moments(drives: Sequence[Ends]) -> dict[str, float]:
     """`MOMENT_COLUMNS`, all starts of a ring alike."""
     axes = np.vstack([one.axes for one in drives])
-    ring = np.concatenate([one.starts.ring for one in drives])
+    ring, error, nvtl, tp = (
+        np.concatenate(parts)
+        for parts in zip(*((d.starts.ring, d.error, d.nvtl, d.tp) for d in drives), strict=True)
+    )
+    held = error <= FAILED
     found: dict[str, float] = {}
     for number, name in enumerate(RINGS):
-        here = axes[ring == number]
-        mean, square = here.mean(axis=0), np.einsum("ki,kj->ij", here, here) / len(here)
-        found |= {f"vd_{name}_{axis}": float(value) for axis, value in zip(AXES, mean, strict=True)}
-        for (i, a), (j, b) in itertools.combinations_with_replacement(enumerate(AXES), 2):
-            found[f"vd_{name}_{a}_{b}"] = float(square[i, j])
-    return found
+        here = ring == number
+        found |= moments_of(f"vd_{name}", axes[here], held[here])
+    near = ring == 0
+    return found | scores_of("vd_near", nvtl[near], tp[near], held[near])
 
 
 def weighted_median(values: Float64, weight: Float64) -> float:

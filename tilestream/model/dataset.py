@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tilestream.errors import ModelError, UsageError
 from tilestream.factors.along_route import AVERAGED, averaged_along
+from tilestream.factors.virtual_drive import MOMENT_COLUMNS
 from tilestream.notebook import html_table
 from tilestream.records import Column, Float64, Int64
 from tilestream.sensor import Sensor
@@ -34,7 +35,9 @@ WITHOUT_DRIVES = "`tilestream estimate` and model: {recipe: physics} need no dri
 """What there is for whoever has nothing to learn from."""
 OF_LIDAR = ("registration", "as_sensor")
 """What of the identity of labels may differ from run to run: a model over several knows it."""
-VIRTUAL_DRIVES = ("group", "route_id", "sample", "arc_length", "status", *AVERAGED)
+MOMENTS = tuple(column.name for column in MOMENT_COLUMNS)
+"""Columns of the virtual drive that a covariance is made of, and no estimate."""
+VIRTUAL_DRIVES = ("group", "route_id", "sample", "arc_length", "status", *AVERAGED, *MOMENTS)
 """What is kept of the virtual drives of all places of the drives."""
 
 

@@ -3,9 +3,11 @@
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
-from tilestream.label import summary
+from tilestream.label import FAILED, NEAR, summary
+from tilestream.moments import AXES, moment_columns, moments_of, score_columns, scores_of
 from tilestream.pipeline.engine.outputs import Made, Stored
 from tilestream.pipeline.engine.stage import stage
 from tilestream.pipeline.stages.drive_scans import Sample
@@ -66,6 +68,8 @@ ERROR_COLUMNS = (
         "definitions, section 5",
     ),
     Column("error_tail", "label", "m", "error_mean - error_floor.", "definitions, section 5"),
+    *moment_columns("near", "starts within 1 m", "label", "definitions, section 5.6"),
+    *score_columns("near", "starts within 1 m", "label", "definitions, section 5.6"),
     Column("status", "place", "", "done, or failed.", "", dtype="str"),
     Column("reason", "place", "", "Why it failed.", "", dtype="str"),
 )
@@ -79,7 +83,7 @@ BYTES_PER_ROW = 600
 
 @stage(
     "label",
-    version=4,
+    version=5,
     memory=lambda counts: FIXED_BYTES + BYTES_PER_ROW * counts["rows"],
     seconds=0.006,
     columns=ERROR_COLUMNS,
@@ -129,21 +133,33 @@ def _row(
     }
     if good:
         own = [sample.scan for sample, _ in good]
-        row |= _summed(starts[starts["scan"].isin(own)])
+        row |= _summed(starts[starts["scan"].isin(own)], {s.scan: f["points"] for s, f in good})
         row["points"] = round(sum(fact["points"] for _, fact in good) / len(good))
     return row
 
 
-def _summed(starts: pd.DataFrame) -> dict[str, float]:
-    """The label of one sample point from the rows of the starts of all its scans."""
+def _summed(starts: pd.DataFrame, points: dict[int, int]) -> dict[str, float]:
+    """The label of one sample point from the rows of the starts of all its scans.
+
+    Args:
+        starts: the rows.
+        points: of each scan how many were registered.
+    """
     starts = starts.sort_values(["scan", "start"])
     names = ("along", "across", "up", "roll", "pitch", "yaw", "error")
     errors = {name: starts[name].to_numpy() for name in names}
+    distance = starts["distance"].to_numpy()
+    near = starts[distance <= NEAR + 1e-9]
+    held = near["error"].to_numpy() <= FAILED
+    of_scan = near["scan"].map(points).to_numpy(np.float64)
+    nvtl, tp = near["nvtl"] * of_scan / near["hits"], near["score"] / of_scan
     return {
         "starts": len(starts),
         "scan_spread": float(starts.groupby("scan")["error"].mean().std()),
         "converged": float(starts["converged"].mean()),
         "iterations": float(starts["iterations"].mean()),
         "nvtl": float(starts["nvtl"].mean()),
-        **summary(errors, starts["distance"].to_numpy()),
+        **summary(errors, distance),
+        **moments_of("near", near[list(AXES)].to_numpy(), held),
+        **scores_of("near", nvtl.to_numpy(), tp.to_numpy(), held),
     }

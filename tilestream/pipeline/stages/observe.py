@@ -55,7 +55,7 @@ class Observing:
 
 @stage(
     "observe",
-    version=6,
+    version=7,
     memory=lambda counts: (
         FIXED_BYTES + (BYTES_PER_POINT + BYTES_PER_DRAW * counts["draws"]) * counts["points"]
     ),
