@@ -4,6 +4,8 @@ Where a registration ends is random to a degree, and places 1 m apart see nearly
 drives are repeated samples of one value.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 import pandas as pd
 
@@ -24,7 +26,9 @@ SLACK = 1e-6
 """Arc lengths are sums: neighbours at the full distance may lie this much beyond it [m]."""
 
 
-def averaged_along(places: pd.DataFrame, width: float) -> pd.DataFrame:
+def averaged_along(
+    places: pd.DataFrame, width: float, columns: Sequence[str] = AVERAGED
+) -> pd.DataFrame:
     """The virtual drives of sample points, averaged with those of their neighbours on the route.
 
     The kernel is a Gaussian of standard deviation `width`, cut off at `CUT` of it, over the points
@@ -33,13 +37,14 @@ def averaged_along(places: pd.DataFrame, width: float) -> pd.DataFrame:
     outweighs the other, and the last point stands for itself.
 
     Args:
-        places: a row per sample point: `route_id`, `arc_length` [m], `status`, `AVERAGED`; an index
+        places: a row per sample point: `route_id`, `arc_length` [m], `status`, `columns`; an index
             without repeats. The average of a point is right if all points of its route within
             `CUT * width` of it are there.
         width: of the kernel [m]; 0: the table is given back as it is.
+        columns: what is averaged.
 
     Returns:
-        The table, rows in the same order, `AVERAGED` of the points that are done as weighted means:
+        The table, rows in the same order, `columns` of the points that are done as weighted means:
         the same to the bit in any company.
     """
     if width == 0.0:
@@ -48,8 +53,8 @@ def averaged_along(places: pd.DataFrame, width: float) -> pd.DataFrame:
     done = places[places["status"] == "done"].sort_values("arc_length", kind="stable")
     for _, route in done.groupby("route_id", sort=False):
         arc = route["arc_length"].to_numpy(np.float64)
-        values = route[list(AVERAGED)].to_numpy(np.float64)
-        averaged.loc[route.index, list(AVERAGED)] = _of_route(arc, values, width)
+        values = route[list(columns)].to_numpy(np.float64)
+        averaged.loc[route.index, list(columns)] = _of_route(arc, values, width)
     return averaged
 
 

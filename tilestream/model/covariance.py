@@ -1,0 +1,215 @@
+"""The covariance of a registration at a place (definitions, section 6.6).
+
+Of a filter's registration, which starts from the filter's own prediction and not anywhere in the
+disc: the core of the starts that hold is made of the moments of the virtual drive, what real scans
+add to it is learnt, and the share of the registrations that are lost is told apart.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.optimize import minimize
+from scipy.stats import chi2
+
+from tilestream.factors.along_route import averaged_along
+from tilestream.factors.virtual_drive import RINGS
+from tilestream.label import disc_starts
+from tilestream.moments import AXES, PAIRS, SCORES, unit_of
+from tilestream.records import Column, Float64
+
+PREDICTION_ERROR = 0.3
+"""Standard deviation of a filter's prediction in map x and in y, where nobody states one [m]."""
+ELEMENTS = tuple(f"cov_{a}_{b}" for a, b in PAIRS)
+"""The upper triangle of the covariance, row by row."""
+_SOURCE = "definitions, section 6.6"
+COVARIANCE_COLUMNS = (
+    *(
+        Column(name, "label", unit_of(a, b), f"Covariance of the errors in {a} and {b}.", _SOURCE)
+        for name, (a, b) in zip(ELEMENTS, PAIRS, strict=True)
+    ),
+    Column(
+        "p_lost",
+        "label",
+        "1",
+        "Share of registrations from the filter's prediction that end more than 0.5 m away.",
+        _SOURCE,
+    ),
+    *(
+        Column(f"{name}{end}", "label", "1", f"{of} {words} of a registration that holds.", _SOURCE)
+        for name, words in (("nvtl", "NVTL"), ("tp", "transform probability"))
+        for end, of in (("", "Expected"), ("_low", "Least normal"), ("_high", "Largest normal"))
+    ),
+)
+"""What is said of a filter's registration at a place, in the frame of the route."""
+NORMAL = 0.95
+"""Share of the registrations whose scores are normal."""
+_INDEX = tuple((AXES.index(a), AXES.index(b)) for a, b in PAIRS)
+_MOMENTS = tuple(f"{a}_{b}" for a, b in PAIRS)
+
+
+def ring_weights(prediction_error: float) -> dict[str, float]:
+    """The share of a filter's predictions in each ring of the disc, by its name; what lies beyond
+    the disc counts as in its outermost ring.
+
+    Args:
+        prediction_error: standard deviation in map x and in y [m].
+    """
+    whole = float(np.hypot(*disc_starts().T).max())
+    outer = [edge * whole for _, edge, _ in RINGS.values()][:-1]
+    within = [1.0 - math.exp(-0.5 * (edge / prediction_error) ** 2) for edge in outer]
+    edges = [0.0, *within, 1.0]
+    return {name: edges[k + 1] - edges[k] for k, name in enumerate(RINGS)}
+
+
+def cores(seen: pd.DataFrame, prediction_error: float, width: float) -> pd.DataFrame:
+    """What the virtual drive says of a filter's registration at each place.
+
+    Args:
+        seen: a row per sample point: `route_id`, `arc_length`, `status`, and the moments of the
+            virtual drive (`factors.virtual_drive.MOMENT_COLUMNS`).
+        prediction_error: standard deviation of the filter's prediction in map x and in y [m].
+        width: of the kernel along the route over which moments are averaged [m].
+
+    Returns:
+        On its index: `ELEMENTS` (second moments about the truth, so that a bias counts), `p_lost`,
+        `nvtl`, `nvtl_sd`, `tp`, `tp_sd`. NaN where nothing holds; `p_lost` is 1 there.
+    """
+    held = pd.DataFrame({"held": 0.0}, index=seen.index)
+    held = held.assign(**dict.fromkeys(_MOMENTS, 0.0))
+    for ring, weight in ring_weights(prediction_error).items():
+        share = weight * (1.0 - seen[f"vd_{ring}_p_fail"])
+        held["held"] += share
+        for name in _MOMENTS:
+            held[name] += (share * seen[f"vd_{ring}_{name}"]).where(share > 0.0, 0.0)
+    near = 1.0 - seen["vd_near_p_fail"]
+    held["near"] = near
+    for name in SCORES:
+        mean, spread = seen[f"vd_near_{name}"], seen[f"vd_near_{name}_sd"]
+        held[name] = (near * mean).where(near > 0.0, 0.0)
+        held[f"{name}_square"] = (near * (mean**2 + spread**2)).where(near > 0.0, 0.0)
+    columns = [str(name) for name in held]
+    keys = seen[["route_id", "arc_length", "status"]]
+    held = averaged_along(pd.concat([keys, held], axis=1), width, columns)
+    count, near = (held[name].where(held[name] > 0.0) for name in ("held", "near"))
+    found: dict[str, Any] = {
+        name: held[m] / count for name, m in zip(ELEMENTS, _MOMENTS, strict=True)
+    }
+    found["p_lost"] = 1.0 - held["held"]
+    for name in SCORES:
+        mean = held[name] / near
+        found[name] = mean
+        found[f"{name}_sd"] = np.sqrt((held[f"{name}_square"] / near - mean**2).clip(lower=0.0))
+    return pd.DataFrame(found, index=seen.index)
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """What real scans add to the cores of virtual ones."""
+
+    scale: Float64
+    """(6,) what the second moment of each axis is multiplied by …"""
+    added: Float64
+    """(6,) … and what is added to it [m^2, rad^2]."""
+    lost: float
+    """What is added to the share of lost registrations."""
+    scores: Mapping[str, tuple[float, float]]
+    """By `SCORES`: what a real score is multiplied by, and by how much its standard deviation is
+    larger, as a share of the score."""
+    width: float
+    """Of the kernel along the route [m]."""
+    places: int
+    """On how many labels it was learnt; 0: it is what the virtual drive says."""
+
+
+def as_it_is(width: float) -> Calibration:
+    """Of a virtual drive without training."""
+    plain = dict.fromkeys(SCORES, (1.0, 0.0))
+    return Calibration(np.ones(6), np.zeros(6), 0.0, plain, width, 0)
+
+
+def calibrated(core: pd.DataFrame, calibration: Calibration) -> pd.DataFrame:
+    """The covariances of places, in `COVARIANCE_COLUMNS`, on the index of `core` (`cores`)."""
+    root = np.sqrt(calibration.scale)
+    found: dict[str, Any] = {}
+    for name, (i, j) in zip(ELEMENTS, _INDEX, strict=True):
+        added = calibration.added[i] if i == j else 0.0
+        found[name] = root[i] * root[j] * core[name] + added
+    found["p_lost"] = (core["p_lost"] + calibration.lost).clip(0.0, 1.0)
+    reach = math.sqrt(float(chi2.ppf(NORMAL, 1)))
+    for name in SCORES:
+        times, more = calibration.scores[name]
+        mean = times * core[name]
+        spread = reach * np.hypot(times * core[f"{name}_sd"], more * mean)
+        found[name] = mean
+        found[f"{name}_low"], found[f"{name}_high"] = (mean - spread).clip(lower=0.0), mean + spread
+    return pd.DataFrame(found)[[column.name for column in COVARIANCE_COLUMNS]]
+
+
+def calibrate_covariance(core: pd.DataFrame, labels: pd.DataFrame, width: float) -> Calibration:
+    """What the labels of places add to their cores.
+
+    Scale and addition of an axis are the likeliest of Gaussian errors whose second moment is what
+    the label has, so that errors normalised by them have a mean square of 1.
+
+    Args:
+        core: of the places (`cores`, averaged over `width`).
+        labels: their label rows: `near_p_fail`, `near_along_along`, …; `near_nvtl`, …
+        width: of the kernel [m].
+    """
+    good = (core["cov_along_along"].notna() & labels["near_along_along"].notna()).to_numpy()
+    core, labels = core[good], labels[good]
+    fits = [
+        _fitted(core[f"cov_{a}_{a}"].to_numpy(), labels[f"near_{a}_{a}"].to_numpy()) for a in AXES
+    ]
+    scale, added = np.array(fits).T
+    lost = float((labels["near_p_fail"].to_numpy() - core["p_lost"].to_numpy()).mean())
+    scores = {}
+    for name in SCORES:
+        times = labels[f"near_{name}"].to_numpy() / core[name].to_numpy()
+        middle = float(np.median(times))
+        scores[name] = (middle, float(1.4826 * np.median(np.abs(times - middle)) / middle))
+    return Calibration(scale, added, lost, scores, width, len(core))
+
+
+def _fitted(core: Float64, label: Float64) -> tuple[float, float]:
+    """Scale and addition of one axis."""
+    typical = max(float(label.mean()), 1e-12)
+    core, label = core / typical, label / typical
+
+    def unlikely(logs: Float64) -> float:
+        variance = math.exp(logs[0]) * core + math.exp(logs[1])
+        return float((np.log(variance) + label / variance).mean())
+
+    starts = [np.log([0.5, 0.5]), np.log([1.0, 0.05]), np.log([0.05, 1.0])]
+    found = min(
+        (minimize(unlikely, s, method="L-BFGS-B", bounds=[(-12, 6)] * 2) for s in starts),
+        key=lambda one: one.fun,
+    )
+    scale, added = np.exp(found.x)
+    return float(scale), float(added * typical)
+
+
+def matrices(places: pd.DataFrame) -> Float64:
+    """(n, 6, 6) covariances in the frame of the route, from `ELEMENTS`."""
+    found = np.empty((len(places), 6, 6))
+    for name, (i, j) in zip(ELEMENTS, _INDEX, strict=True):
+        found[:, i, j] = found[:, j, i] = places[name].to_numpy(np.float64)
+    return found
+
+
+def in_map(route: Float64, heading: Float64) -> Float64:
+    """(n, 6, 6) covariances in the map frame (x, y, z, rotation vector) from those in that of the
+    route (along, across, up, rotation vector), whose `heading` (n,) is from the map's x axis [rad].
+    """
+    c, s = np.cos(heading), np.sin(heading)
+    turn = np.zeros((len(heading), 6, 6))
+    for at in (0, 3):
+        turn[:, at, at] = turn[:, at + 1, at + 1] = c
+        turn[:, at, at + 1], turn[:, at + 1, at] = -s, s
+        turn[:, at + 2, at + 2] = 1.0
+    turned: Float64 = np.einsum("nij,njk,nlk->nil", turn, route, turn)
+    return turned
