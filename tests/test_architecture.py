@@ -21,7 +21,7 @@ FLOORS = (
     ("store", "tables", "formats", "simulation"),
     ("from_above", "local_map", "thinned"),
     ("registration",),
-    ("label",),
+    ("label", "moments"),
     ("factors",),
     ("model",),
     ("report",),

@@ -21,6 +21,7 @@ from tilestream.config import Settings
 from tilestream.errors import UsageError
 from tilestream.factors import catalogue, observability
 from tilestream.factors.rows import PLACE_COLUMNS, STATUS_COLUMNS
+from tilestream.model.covariance import COVARIANCE_COLUMNS
 from tilestream.model.dataset import TARGETS
 from tilestream.model.features import features_of
 from tilestream.model.training import PREDICTION_COLUMNS
@@ -54,7 +55,7 @@ TABLES: dict[str, tuple[Column, ...]] = {
     "lost": LOST_COLUMNS,
     "judged": HELD_OUT_COLUMNS,
     "weights": WEIGHT_COLUMNS,
-    "predictions": (*PLACE_COLUMNS, *PREDICTION_COLUMNS),
+    "predictions": (*PLACE_COLUMNS, *PREDICTION_COLUMNS, *COVARIANCE_COLUMNS),
 }
 """The columns of each kind of table in a run directory."""
 GIVEN: dict[str, type[Settings]] = {

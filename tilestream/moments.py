@@ -1,4 +1,4 @@
-"""Where starts end, in moments: what a covariance is made of (definitions, section 5.6).
+"""Where starts end, in moments: what a covariance is made of (definitions, section 5.4).
 
 Of starts near the truth the held ones, which end within 0.5 m of it, make a core that has moments;
 how many do not is told apart from it.

@@ -322,6 +322,10 @@ class ReportSettings(Settings):
     in every report."""
 
 
+PREDICTION_ERROR = 0.3
+"""How far off a filter predicts its pose where nobody says it [m]."""
+
+
 class PlaceSettings(Settings):
     """Where a job looks from, and the vehicle that looks."""
 
@@ -339,6 +343,9 @@ class PlaceSettings(Settings):
     `lidar` take it as it is."""
     cell_size: Positive = 2.0
     """Edge of an NDT cell [m]."""
+    prediction_error: Annotated[float, Field(gt=0.0, le=2.0)] = PREDICTION_ERROR
+    """How far off the vehicle's filter predicts its pose, from which a registration then starts:
+    standard deviation in map x and in y [m]. Covariances are of such registrations."""
     memory: Bytes = Field(default="1.5GB", validate_default=True)
     """What one task may use [bytes], also as 512MB or 2GB."""
 

@@ -28,6 +28,7 @@ from tilestream.errors import (
 )
 from tilestream.factors.rows import PLACE_COLUMNS
 from tilestream.files import Files, place_of
+from tilestream.model.covariance import COVARIANCE_COLUMNS
 from tilestream.model.join import ON_PATH
 from tilestream.model.training import ESTIMATES, MAIN, PREDICTION_COLUMNS
 from tilestream.notebook import axes_of, html_of
@@ -42,7 +43,7 @@ from tilestream.store import TileStore
 from tilestream.tables import read_tables
 
 PLACE = [column.name for column in PLACE_COLUMNS]
-ESTIMATED = [column.name for column in PREDICTION_COLUMNS]
+ESTIMATED = [column.name for column in (*PREDICTION_COLUMNS, *COVARIANCE_COLUMNS)]
 MEASURED = {
     target: "measured" if target == MAIN else f"measured_{name}"
     for target, name in ESTIMATES.items()

@@ -66,7 +66,7 @@ def estimate(
         PlaceSettings,
         fields(
             *("sensor", "sensor_height", "spacing", "project_to", "route_z", "cell_size"),
-            "memory",
+            *("prediction_error", "memory"),
         ),
     ],
     seeing: Annotated[VirtualSettings, fields("range_max", "blind_rear_deg")],

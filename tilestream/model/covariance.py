@@ -1,10 +1,11 @@
-"""The covariance of a registration at a place (definitions, section 6.6).
+"""The covariance of a registration at a place (definitions, section 6.8).
 
 Of a filter's registration, which starts from the filter's own prediction and not anywhere in the
 disc: the core of the starts that hold is made of the moments of the virtual drive, what real scans
 add to it is learnt, and the share of the registrations that are lost is told apart.
 """
 
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,17 +16,19 @@ import pandas as pd
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
-from tilestream.factors.along_route import averaged_along
+from tilestream.errors import ModelError, foreign_errors
+from tilestream.factors.along_route import WIDTH, WIDTHS, averaged_along
 from tilestream.factors.virtual_drive import RINGS
 from tilestream.label import disc_starts
+from tilestream.model.dataset import Dataset
+from tilestream.model.splits import block_splits
 from tilestream.moments import AXES, PAIRS, SCORES, unit_of
 from tilestream.records import Column, Float64
+from tilestream.settings import PREDICTION_ERROR
 
-PREDICTION_ERROR = 0.3
-"""Standard deviation of a filter's prediction in map x and in y, where nobody states one [m]."""
 ELEMENTS = tuple(f"cov_{a}_{b}" for a, b in PAIRS)
 """The upper triangle of the covariance, row by row."""
-_SOURCE = "definitions, section 6.6"
+_SOURCE = "definitions, section 6.8"
 COVARIANCE_COLUMNS = (
     *(
         Column(name, "label", unit_of(a, b), f"Covariance of the errors in {a} and {b}.", _SOURCE)
@@ -125,6 +128,39 @@ class Calibration:
     """On how many labels it was learnt; 0: it is what the virtual drive says."""
 
 
+def as_json(calibration: Calibration) -> dict[str, Any]:
+    """A calibration as plain JSON."""
+    return {
+        "scale": calibration.scale.tolist(),
+        "added": calibration.added.tolist(),
+        "lost": calibration.lost,
+        "scores": {name: list(pair) for name, pair in calibration.scores.items()},
+        "width": calibration.width,
+        "places": calibration.places,
+    }
+
+
+def from_json(told: Any) -> Calibration:
+    """A calibration from `as_json`.
+
+    Raises:
+        ModelError: it is not one.
+    """
+    with foreign_errors(ModelError, "a damaged model file: no covariances", "train it again"):
+        scale, added = (np.array(told[name], np.float64) for name in ("scale", "added"))
+        scores = {
+            name: (float(told["scores"][name][0]), float(told["scores"][name][1]))
+            for name in SCORES
+        }
+        numbers = [*scale, *added, told["lost"], *itertools.chain(*scores.values())]
+        if scale.shape != (6,) or added.shape != (6,) or not np.isfinite(numbers).all():
+            raise ValueError("not six finite numbers each")
+        if (scale < 0.0).any() or (added < 0.0).any() or told["width"] not in WIDTHS:
+            raise ValueError("a variance below 0, or no width of averages")
+        width, places = float(told["width"]), int(told["places"])
+        return Calibration(scale, added, float(told["lost"]), scores, width, places)
+
+
 def as_it_is(width: float) -> Calibration:
     """Of a virtual drive without training."""
     plain = dict.fromkeys(SCORES, (1.0, 0.0))
@@ -173,6 +209,68 @@ def calibrate_covariance(core: pd.DataFrame, labels: pd.DataFrame, width: float)
         middle = float(np.median(times))
         scores[name] = (middle, float(1.4826 * np.median(np.abs(times - middle)) / middle))
     return Calibration(scale, added, lost, scores, width, len(core))
+
+
+def cores_of(dataset: Dataset, prediction_error: float, width: float) -> pd.DataFrame:
+    """The cores (`cores`) of the places of a dataset, on the index of its rows; their neighbours
+    are all places of the same drive, labelled or not.
+    """
+    seen = dataset.virtual_drives
+    drives = [cores(drive, prediction_error, width) for _, drive in seen.groupby("group")]
+    keys = ["group", "sample"]
+    found = pd.concat(drives).join(seen[keys]).set_index(keys)
+    here = found.reindex(pd.MultiIndex.from_frame(dataset.rows[keys]))
+    return here.set_index(dataset.rows.index)
+
+
+def calibration_of(dataset: Dataset) -> Calibration | None:
+    """What the labels of a dataset add to the cores of its places.
+
+    The width of the kernel is the candidate whose calibration makes the errors on held-out blocks
+    likeliest; `WIDTH` where none can be held out.
+
+    Returns:
+        None: no virtual drives, or labels without moments, as those of older versions.
+    """
+    if dataset.virtual_drives.empty or "near_along_along" not in dataset.rows:
+        return None
+    try:
+        splits = block_splits(dataset)
+    except ModelError:
+        widths: tuple[float, ...] = (WIDTH,)
+        splits = []
+    else:
+        widths = WIDTHS
+    labels, found = dataset.rows, []
+    for width in widths:
+        core = cores_of(dataset, PREDICTION_ERROR, width)
+        surprise = [
+            unlikelihood(
+                calibrated(
+                    core.iloc[s.test],
+                    calibrate_covariance(core.iloc[s.train], labels.iloc[s.train], width),
+                ),
+                labels.iloc[s.test],
+            )
+            for s in splits
+        ]
+        total = sum(float(one.sum()) for one in surprise)
+        found.append((total, calibrate_covariance(core, labels, width)))
+    return min(found, key=lambda one: one[0])[1]
+
+
+def unlikelihood(places: pd.DataFrame, labels: pd.DataFrame) -> pd.Series:
+    """How unlikely the errors of held starts are under covariances: minus the logarithm of a
+    Gaussian density in position, doubled, without its constant; a row per place that has both.
+    """
+    good = (places["cov_along_along"].notna() & labels["near_along_along"].notna()).to_numpy()
+    covariance = matrices(places[good])[:, :3, :3]
+    seen = np.empty_like(covariance)
+    for (a, b), (i, j) in zip(PAIRS, _INDEX, strict=True):
+        if i < 3 and j < 3:
+            seen[:, i, j] = seen[:, j, i] = labels.loc[good, f"near_{a}_{b}"]
+    fits = np.einsum("nij,nji->n", np.linalg.inv(covariance), seen)
+    return pd.Series(np.linalg.slogdet(covariance)[1] + fits, index=places.index[good])
 
 
 def _fitted(core: Float64, label: Float64) -> tuple[float, float]:

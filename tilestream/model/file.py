@@ -21,6 +21,7 @@ import skops.io
 from tilestream.errors import ModelError, SourceNotFoundError, foreign_errors
 from tilestream.factors.along_route import WIDTHS
 from tilestream.files import Files
+from tilestream.model.covariance import as_json, from_json
 from tilestream.model.domain import Domain
 from tilestream.model.explain import Typical
 from tilestream.model.intervals import Interval
@@ -81,6 +82,7 @@ def save_model(model: Model, path: str | os.PathLike[str]) -> None:
         "worst": model.worst,
         "facts": dict(model.facts),
         "card": dict(model.card),
+        "covariance": None if model.covariance is None else as_json(model.covariance),
     }
     content = {  # "forests" is what version 0.1 calls the regressors
         "facts": json.dumps(facts, sort_keys=True),
@@ -231,4 +233,5 @@ def _model(content: Mapping[str, Any], facts: Mapping[str, Any]) -> Model:
         worst=float(facts["worst"]),
         facts=facts["facts"],
         card=facts.get("card", {}),  # files of older versions have none
+        covariance=from_json(facts["covariance"]) if facts.get("covariance") else None,  # neither
     )

@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_limits
 from tilestream.errors import ModelError, UsageError
 from tilestream.factors.own import OWN
 from tilestream.model.card import JUDGED, card_of
+from tilestream.model.covariance import Calibration, calibration_of
 from tilestream.model.dataset import TARGETS, Dataset, matrix
 from tilestream.model.domain import WIDEST, Domain, domain_of
 from tilestream.model.explain import PIECE, Typical, compared, in_words, typical_of
@@ -117,6 +118,9 @@ class Model:
     """What it was trained on, and over which lidars and matchers it holds (`card_of`); empty: of
     an older version, for one lidar."""
 
+    covariance: Calibration | None = None
+    """What real scans add to the covariances of the virtual drive; None: not known."""
+
     @property
     def wider_outside(self) -> float:
         """How many times longer an interval is for a lidar or a matcher outside of the card."""
@@ -188,6 +192,7 @@ def train(
             "lost": dataset.losses,
         },
         card=card,
+        covariance=calibration_of(whole),
     )
 
 

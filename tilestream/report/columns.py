@@ -2,6 +2,7 @@
 
 from tilestream.factors import catalogue, observability
 from tilestream.factors.rows import PLACE_COLUMNS
+from tilestream.model.covariance import COVARIANCE_COLUMNS
 from tilestream.model.features import SPREAD_ACROSS, SPREAD_ALONG, WEAK_ALONG
 from tilestream.model.figures import SEGMENT
 from tilestream.model.training import PREDICTION_COLUMNS
@@ -53,6 +54,7 @@ CATALOGUE = {
         SPREAD_ACROSS,
         *observability.COLUMNS,
         *PREDICTION_COLUMNS,
+        *COVARIANCE_COLUMNS,
     )
 }
 """What each column of the places means."""

@@ -19,6 +19,7 @@ from tilestream.pipeline.jobs.run import run
 from tilestream.pipeline.jobs.run_settings import ModelSettings, RunSettings
 from tilestream.sensor import VLP16, Carrier, sensor_of
 from tilestream.settings import (
+    PREDICTION_ERROR,
     LabelSettings,
     MapSettings,
     PlaceSettings,
@@ -44,6 +45,7 @@ def estimate(
     range_max: float | None = None,
     blind_rear_deg: float = 0.0,
     matcher: RegistrationSettings | str | os.PathLike[str] = "autoware",
+    prediction_error: float = PREDICTION_ERROR,
     spacing: float = 1.0,
     crs: str | None = None,
     project_to: str | None = None,
@@ -70,6 +72,8 @@ def estimate(
         blind_rear_deg: sector to the rear that the vehicle hides [deg].
         matcher: the vehicle's scan matcher: `autoware`, `default`, its settings, or Autoware's own
             parameter file or folder.
+        prediction_error: how far off the vehicle's filter predicts its pose, standard deviation in
+            map x and in y [m]: covariances are of registrations that start from there.
         spacing: distance between places [m].
         crs: CRS of the map, where its files do not say.
         project_to: CRS to project routes to; None: the map's.
@@ -88,7 +92,7 @@ def estimate(
     """
     seeing = VirtualSettings(range_max=range_max, blind_rear_deg=blind_rear_deg)
     places: dict[str, Any] = {"sensor": sensor, "sensor_height": sensor_height, "spacing": spacing}
-    places |= {"project_to": project_to, "memory": memory}
+    places |= {"project_to": project_to, "memory": memory, "prediction_error": prediction_error}
     settings = estimate_settings(
         _listed(sources),
         _listed(routes),

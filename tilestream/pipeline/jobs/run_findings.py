@@ -13,6 +13,7 @@ from tilestream.factors.heights import note_of_drive, notes_of_routes
 from tilestream.factors.scan_at import scan_at
 from tilestream.from_above import FromAbove, seen_from_above
 from tilestream.grid import MM_PER_M, Box, TileKey
+from tilestream.model.covariance import COVARIANCE_COLUMNS
 from tilestream.model.dataset import POINTS_MIN, TARGETS, Dataset, nearest_along
 from tilestream.model.evaluation import (
     differences_by_protocol,
@@ -97,7 +98,8 @@ def places_of(done: Done) -> pd.DataFrame:
     places = places_with_factors(factors, observed, done.width)
     places = places.drop(columns=["status", "reason"])
     tables = paths_of(done.outputs("predict"))
-    names = [column.name for column in PREDICTION_COLUMNS]
+    columns = (*PREDICTION_COLUMNS, *COVARIANCE_COLUMNS)
+    names = [column.name for column in columns]
     if tables:
         found = read_tables(tables)[[*PLACE, *names]]
     else:
@@ -107,7 +109,7 @@ def places_of(done: Done) -> pd.DataFrame:
     joined["in_domain"] = joined["in_domain"].astype("boolean")
     joined.loc[lost, "status"] = "failed"
     joined.loc[lost, "reason"] = "no estimate: its task failed, see run.json"
-    dtypes = {c.name: c.dtype for c in PREDICTION_COLUMNS if c.dtype == "float64"}
+    dtypes = {c.name: c.dtype for c in columns if c.dtype == "float64"}
     return joined.astype(dtypes)
 
 

@@ -330,7 +330,11 @@ def _predictions(
                 predict,
                 str(task.tile),
                 Parquet(f"{settings.out}/tables/predictions/{task.tile}.parquet"),
-                takes={"making": making, "offset": settings.model.offset or 0.0},
+                takes={
+                    "making": making,
+                    "offset": settings.model.offset or 0.0,
+                    "prediction_error": settings.prediction_error,
+                },
                 reads={**reads, "factors": task.product, "observed": _products(near)},
                 work=task.work,
                 counts={"places": sum(one.work for one in (task, *near))},

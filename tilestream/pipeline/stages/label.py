@@ -68,8 +68,8 @@ ERROR_COLUMNS = (
         "definitions, section 5",
     ),
     Column("error_tail", "label", "m", "error_mean - error_floor.", "definitions, section 5"),
-    *moment_columns("near", "starts within 1 m", "label", "definitions, section 5.6"),
-    *score_columns("near", "starts within 1 m", "label", "definitions, section 5.6"),
+    *moment_columns("near", "starts within 1 m", "label", "definitions, section 5.4"),
+    *score_columns("near", "starts within 1 m", "label", "definitions, section 5.4"),
     Column("status", "place", "", "done, or failed.", "", dtype="str"),
     Column("reason", "place", "", "Why it failed.", "", dtype="str"),
 )

@@ -8,6 +8,7 @@ import pandas as pd
 
 from tilestream.factors.along_route import WIDTH
 from tilestream.factors.rows import PLACE_COLUMNS
+from tilestream.model.covariance import COVARIANCE_COLUMNS, as_it_is, calibrated, cores
 from tilestream.model.explain import without_training
 from tilestream.model.physics import Physics
 from tilestream.model.training import ESTIMATES, PREDICTION_COLUMNS, Model
@@ -25,16 +26,17 @@ MODEL_BYTES = 300_000_000
 
 @stage(
     "predict",
-    version=6,
+    version=7,
     memory=lambda counts: MODEL_BYTES + BYTES_PER_ROW * counts["places"],
     seconds=0.004,
-    columns=(*PLACE_COLUMNS, *PREDICTION_COLUMNS),
+    columns=(*PLACE_COLUMNS, *PREDICTION_COLUMNS, *COVARIANCE_COLUMNS),
 )
 def predict(
     factors: Stored,
     observed: Sequence[Stored],
     making: dict[str, Any],
     offset: float,
+    prediction_error: float,
     model: Model | None = None,
 ) -> pd.DataFrame:
     """The estimates of sample points, a row each.
@@ -45,11 +47,40 @@ def predict(
             has no virtual drive.
         making: what the factors were made with.
         offset: without a model: what a real scan adds to the error of a virtual one [m].
+        prediction_error: how far off a filter's prediction is from which a registration starts,
+            standard deviation in map x and in y [m].
         model: None: the virtual drive as it is.
     """
     places = places_with_factors([factors], observed, WIDTH if model is None else model.width)
     found = physical(places, offset) if model is None else predicted(model, places, making)
-    return pd.concat([places[[column.name for column in PLACE_COLUMNS]], found], axis=1)
+    covariance = covariances(places, observed, prediction_error, model)
+    return pd.concat([places[[c.name for c in PLACE_COLUMNS]], found, covariance], axis=1)
+
+
+def covariances(
+    places: pd.DataFrame,
+    observed: Sequence[Stored],
+    prediction_error: float,
+    model: Model | None,
+) -> pd.DataFrame:
+    """`COVARIANCE_COLUMNS` of places, on their index; NaN without a virtual drive.
+
+    Args:
+        places: with `route_id` and `sample`.
+        observed: the tables of observability of these and their neighbours.
+        prediction_error: see `predict`.
+        model: None, or one that knows of no covariances: the virtual drive as it is.
+    """
+    names = [column.name for column in COVARIANCE_COLUMNS]
+    if not observed:
+        return pd.DataFrame(np.nan, index=places.index, columns=names)
+    known = None if model is None else model.covariance
+    known = known or as_it_is(WIDTH if model is None else model.width)
+    seen = pd.concat([table.rows for table in observed], ignore_index=True)
+    found = calibrated(cores(seen, prediction_error, known.width), known)
+    keys = ["route_id", "sample"]
+    found.index = pd.MultiIndex.from_frame(seen[keys])
+    return found.reindex(pd.MultiIndex.from_frame(places[keys])).set_index(places.index)
 
 
 def physical(places: pd.DataFrame, offset: float) -> pd.DataFrame:

@@ -13,6 +13,7 @@ import pyogrio
 from tilestream.errors import TilestreamError
 from tilestream.factors.rows import PLACE_COLUMNS
 from tilestream.files import Files
+from tilestream.model.covariance import COVARIANCE_COLUMNS
 from tilestream.model.training import PREDICTION_COLUMNS
 from tilestream.records import Column
 from tilestream.report.data import Findings
@@ -87,7 +88,13 @@ OF_STRETCH = (
 """What `summary.segment` tells of a stretch over the threshold."""
 _SHOWN = {
     column.name: column
-    for column in (*PLACE_COLUMNS, *PREDICTION_COLUMNS, *MEASURED_COLUMNS, *RANKED)
+    for column in (
+        *PLACE_COLUMNS,
+        *PREDICTION_COLUMNS,
+        *COVARIANCE_COLUMNS,
+        *MEASURED_COLUMNS,
+        *RANKED,
+    )
     if column.name not in ("x", "y", "z")  # the geometry
 }
 """Columns of places that a reader of maps understands; the factors are in the GeoParquet."""
