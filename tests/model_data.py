@@ -9,9 +9,11 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from tilestream.factors.along_route import AVERAGED
+from tilestream.factors.virtual_drive import RINGS
 from tilestream.model.dataset import VIRTUAL_DRIVES, Dataset
 from tilestream.model.join import join
 from tilestream.model.physics import VIRTUAL
+from tilestream.moments import AXES, PAIRS, SCORES
 from tilestream.records import Column
 
 Floats = NDArray[np.float64]
@@ -164,5 +166,25 @@ def with_virtual_drives(
         rows[target] = label * (1.0 + hidden * np.maximum(hint, -1.0))
     seen["vd_tail"] = seen["vd_mean"] - seen["vd_floor"]
     rows = rows.assign(**seen, ob_hint=hint, ob_noise=rng.normal(size=len(rows)))
-    along = rows.assign(route_id=rows["path"], status="done")[list(VIRTUAL_DRIVES)]
+    rows = rows.assign(**_moments("near", rows, [f"{axis}_mean" for axis in AXES[:3]]))
+    virtual = {f"vd_{ring}": [f"vd_{axis}" for axis in AXES[:3]] for ring in RINGS}
+    moments = {
+        k: v for ring, names in virtual.items() for k, v in _moments(ring, rows, names).items()
+    }
+    along = rows.assign(route_id=rows["path"], status="done")
+    along = pd.concat([along, pd.DataFrame(moments, index=rows.index)], axis=1)[
+        list(VIRTUAL_DRIVES)
+    ]
     return replace(found, rows=rows, columns=(*found.columns, *OBSERVED), virtual_drives=along)
+
+
+def _moments(prefix: str, rows: pd.DataFrame, means: Sequence[str]) -> dict[str, Any]:
+    """Moments of Gaussian errors whose mean absolute values along, across and up are columns."""
+    found: dict[str, Any] = {f"{prefix}_{axis}": 0.0 for axis in AXES}
+    found |= {f"{prefix}_{a}_{b}": 1e-4 if a == b else 0.0 for a, b in PAIRS}
+    for axis, name in zip(AXES, means, strict=False):
+        found[f"{prefix}_{axis}_{axis}"] = 1e-5 + np.pi / 2.0 * rows[name] ** 2
+    scores = {f"{prefix}_{name}": 2.0 for name in SCORES} | {
+        f"{prefix}_{n}_sd": 0.1 for n in SCORES
+    }
+    return found | scores | {f"{prefix}_p_fail": rows["p_fail"]}

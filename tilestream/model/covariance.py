@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.optimize import minimize
 from scipy.stats import chi2
 
 from tilestream.errors import ModelError, foreign_errors
@@ -50,6 +49,8 @@ COVARIANCE_COLUMNS = (
 """What is said of a filter's registration at a place, in the frame of the route."""
 NORMAL = 0.95
 """Share of the registrations whose scores are normal."""
+RATIOS = tuple(2.0 ** (k / 4.0) for k in range(-24, 25))
+"""Candidates for what is added to a variance, in mean variances of the virtual drive."""
 _INDEX = tuple((AXES.index(a), AXES.index(b)) for a, b in PAIRS)
 _MOMENTS = tuple(f"{a}_{b}" for a, b in PAIRS)
 
@@ -274,21 +275,16 @@ def unlikelihood(places: pd.DataFrame, labels: pd.DataFrame) -> pd.Series:
 
 
 def _fitted(core: Float64, label: Float64) -> tuple[float, float]:
-    """Scale and addition of one axis."""
-    typical = max(float(label.mean()), 1e-12)
-    core, label = core / typical, label / typical
-
-    def unlikely(logs: Float64) -> float:
-        variance = math.exp(logs[0]) * core + math.exp(logs[1])
-        return float((np.log(variance) + label / variance).mean())
-
-    starts = [np.log([0.5, 0.5]), np.log([1.0, 0.05]), np.log([0.05, 1.0])]
-    found = min(
-        (minimize(unlikely, s, method="L-BFGS-B", bounds=[(-12, 6)] * 2) for s in starts),
-        key=lambda one: one.fun,
-    )
-    scale, added = np.exp(found.x)
-    return float(scale), float(added * typical)
+    """Scale and addition of one axis: of variances s (core + r) the likeliest s is the mean of
+    label / (core + r), so only r is searched for.
+    """
+    typical = max(float(core.mean()), 1e-18)
+    added = typical * np.array([0.0, *RATIOS])
+    variance = np.maximum(core + added[:, None], 1e-6 * typical)
+    scale = (label / variance).mean(axis=1)
+    unlikely = np.log(np.maximum(scale, 1e-12)) + np.log(variance).mean(axis=1)
+    best = int(np.argmin(unlikely))
+    return float(scale[best]), float(scale[best] * added[best])
 
 
 def matrices(places: pd.DataFrame) -> Float64:
