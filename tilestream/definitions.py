@@ -25,6 +25,7 @@ from tilestream.model.covariance import COVARIANCE_COLUMNS
 from tilestream.model.dataset import TARGETS
 from tilestream.model.features import features_of
 from tilestream.model.training import PREDICTION_COLUMNS
+from tilestream.moments import NEAR_COLUMNS
 from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.stages.evaluate import HELD_OUT_COLUMNS
 from tilestream.pipeline.stages.importance import WEIGHT_COLUMNS
@@ -48,7 +49,7 @@ TABLES: dict[str, tuple[Column, ...]] = {
         *(
             column
             for column in ERROR_COLUMNS
-            if column.name in (*TARGETS, "true_pose", "as_sensor")
+            if column.name in (*TARGETS, "true_pose", "as_sensor") or column in NEAR_COLUMNS
         ),
         *features_of(ALL_FACTORS),
     ),

@@ -114,3 +114,10 @@ def autoware_scores(found: Registrations) -> tuple[Float64, Float64]:
     transform probability is the score per point.
     """
     return found.nvtl * found.points / found.hits, found.score / found.points
+
+
+NEAR_COLUMNS = (
+    *moment_columns("near", "starts within 1 m", "label", "definitions, section 5.4"),
+    *score_columns("near", "starts within 1 m", "label", "definitions, section 5.4"),
+)
+"""Of a label: the starts that a filter's registration could have."""

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from tilestream.errors import UsageError
 from tilestream.model.dataset import TARGETS, Dataset
 from tilestream.model.features import features_of, with_derived
+from tilestream.moments import NEAR_COLUMNS
 from tilestream.records import Column, Float64
 
 PLACE = ("route_id", "arc_length", "x", "y", "z", "heading")
@@ -120,7 +121,8 @@ def _joined(group: str, factors: pd.DataFrame | None, labels: pd.DataFrame) -> p
             sample = table.loc[table["sample"].duplicated(), "sample"].iloc[0]
             raise UsageError(f"group {group!r} has {what} {sample} twice: was a file read twice?")
     labels = labels.sort_values("sample", kind="stable").reset_index(drop=True)
-    kept = [n for n in (*TARGETS, "sample", "true_pose", "as_sensor") if n in labels]
+    near = (column.name for column in NEAR_COLUMNS)
+    kept = [n for n in (*TARGETS, *near, "sample", "true_pose", "as_sensor") if n in labels]
     measured = pd.DataFrame({"true_pose": "", "as_sensor": ""}, index=labels.index)
     measured = measured.assign(label_status=labels["status"], label_reason=labels["reason"])
     measured[kept] = labels[kept]

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from tilestream.label import FAILED, NEAR, summary
-from tilestream.moments import AXES, moment_columns, moments_of, score_columns, scores_of
+from tilestream.moments import AXES, NEAR_COLUMNS, moments_of, scores_of
 from tilestream.pipeline.engine.outputs import Made, Stored
 from tilestream.pipeline.engine.stage import stage
 from tilestream.pipeline.stages.drive_scans import Sample
@@ -68,8 +68,7 @@ ERROR_COLUMNS = (
         "definitions, section 5",
     ),
     Column("error_tail", "label", "m", "error_mean - error_floor.", "definitions, section 5"),
-    *moment_columns("near", "starts within 1 m", "label", "definitions, section 5.4"),
-    *score_columns("near", "starts within 1 m", "label", "definitions, section 5.4"),
+    *NEAR_COLUMNS,
     Column("status", "place", "", "done, or failed.", "", dtype="str"),
     Column("reason", "place", "", "Why it failed.", "", dtype="str"),
 )

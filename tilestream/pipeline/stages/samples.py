@@ -176,7 +176,7 @@ MAKERS = (factors_drive, observe_drive, register, label)
 
 @stage(
     "samples",
-    version=6,
+    version=7,
     memory=lambda counts: FOREST_BYTES + BYTES_PER_ROW * counts["places"],
     seconds=0.001,
 )
