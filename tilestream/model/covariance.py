@@ -82,32 +82,29 @@ def cores(seen: pd.DataFrame, prediction_error: float, width: float) -> pd.DataF
         On its index: `ELEMENTS` (second moments about the truth, so that a bias counts), `p_lost`,
         `nvtl`, `nvtl_sd`, `tp`, `tp_sd`. NaN where nothing holds; `p_lost` is 1 there.
     """
-    held = pd.DataFrame({"held": 0.0}, index=seen.index)
-    held = held.assign(**dict.fromkeys(_MOMENTS, 0.0))
+    share, square = np.zeros(len(seen)), np.zeros((len(seen), len(PAIRS)))
     for ring, weight in ring_weights(prediction_error).items():
-        share = weight * (1.0 - seen[f"vd_{ring}_p_fail"])
-        held["held"] += share
-        for name in _MOMENTS:
-            held[name] += (share * seen[f"vd_{ring}_{name}"]).where(share > 0.0, 0.0)
-    near = 1.0 - seen["vd_near_p_fail"]
-    held["near"] = near
-    for name in SCORES:
-        mean, spread = seen[f"vd_near_{name}"], seen[f"vd_near_{name}_sd"]
-        held[name] = (near * mean).where(near > 0.0, 0.0)
-        held[f"{name}_square"] = (near * (mean**2 + spread**2)).where(near > 0.0, 0.0)
-    columns = [str(name) for name in held]
+        here = weight * (1.0 - seen[f"vd_{ring}_p_fail"].to_numpy())
+        moments = seen[[f"vd_{ring}_{name}" for name in _MOMENTS]].to_numpy()
+        share += here
+        square += np.where(here[:, None] > 0.0, here[:, None] * moments, 0.0)
+    near = 1.0 - seen["vd_near_p_fail"].to_numpy()[:, None]
+    mean = seen[[f"vd_near_{name}" for name in SCORES]].to_numpy()
+    spread = seen[[f"vd_near_{name}_sd" for name in SCORES]].to_numpy()
+    scores = np.where(near > 0.0, near * np.hstack([mean, mean**2 + spread**2]), 0.0)
+    columns = ["held", "near", *_MOMENTS, *SCORES, *(f"{name}_square" for name in SCORES)]
+    held = pd.DataFrame(np.column_stack([share, near, square, scores]), seen.index, columns)
     keys = seen[["route_id", "arc_length", "status"]]
     held = averaged_along(pd.concat([keys, held], axis=1), width, columns)
-    count, near = (held[name].where(held[name] > 0.0) for name in ("held", "near"))
-    found: dict[str, Any] = {
-        name: held[m] / count for name, m in zip(ELEMENTS, _MOMENTS, strict=True)
-    }
-    found["p_lost"] = 1.0 - held["held"]
-    for name in SCORES:
-        mean = held[name] / near
-        found[name] = mean
-        found[f"{name}_sd"] = np.sqrt((held[f"{name}_square"] / near - mean**2).clip(lower=0.0))
-    return pd.DataFrame(found, index=seen.index)
+    count, near = (held[[name]].where(held[name] > 0.0).to_numpy() for name in ("held", "near"))
+    found = np.column_stack(
+        [held[list(_MOMENTS)].to_numpy() / count, 1.0 - held["held"], held[list(SCORES)] / near]
+    )
+    mean = found[:, -len(SCORES) :]
+    spread = held[[f"{name}_square" for name in SCORES]].to_numpy() / near - mean**2
+    spread = np.sqrt(np.maximum(spread, 0.0))
+    names = [*ELEMENTS, "p_lost", *SCORES, *(f"{name}_sd" for name in SCORES)]
+    return pd.DataFrame(np.column_stack([found, spread]), seen.index, names)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,8 +118,8 @@ class Calibration:
     lost: float
     """What is added to the share of lost registrations."""
     scores: Mapping[str, tuple[float, float]]
-    """By `SCORES`: what a real score is multiplied by, and by how much its standard deviation is
-    larger, as a share of the score."""
+    """By `SCORES`: how many times larger a real score is than a virtual one, and its standard
+    deviation than that of the virtual ones."""
     width: float
     """Of the kernel along the route [m]."""
     places: int
@@ -164,26 +161,25 @@ def from_json(told: Any) -> Calibration:
 
 def as_it_is(width: float) -> Calibration:
     """Of a virtual drive without training."""
-    plain = dict.fromkeys(SCORES, (1.0, 0.0))
+    plain = dict.fromkeys(SCORES, (1.0, 1.0))
     return Calibration(np.ones(6), np.zeros(6), 0.0, plain, width, 0)
 
 
 def calibrated(core: pd.DataFrame, calibration: Calibration) -> pd.DataFrame:
     """The covariances of places, in `COVARIANCE_COLUMNS`, on the index of `core` (`cores`)."""
     root = np.sqrt(calibration.scale)
-    found: dict[str, Any] = {}
-    for name, (i, j) in zip(ELEMENTS, _INDEX, strict=True):
-        added = calibration.added[i] if i == j else 0.0
-        found[name] = root[i] * root[j] * core[name] + added
-    found["p_lost"] = (core["p_lost"] + calibration.lost).clip(0.0, 1.0)
+    times = [root[i] * root[j] for i, j in _INDEX]
+    added = [calibration.added[i] if i == j else 0.0 for i, j in _INDEX]
+    p_lost = np.clip(core["p_lost"] + calibration.lost, 0.0, 1.0)
+    found = [core[list(ELEMENTS)].to_numpy() * times + added, p_lost]
     reach = math.sqrt(float(chi2.ppf(NORMAL, 1)))
     for name in SCORES:
-        times, more = calibration.scores[name]
-        mean = times * core[name]
-        spread = reach * np.hypot(times * core[f"{name}_sd"], more * mean)
-        found[name] = mean
-        found[f"{name}_low"], found[f"{name}_high"] = (mean - spread).clip(lower=0.0), mean + spread
-    return pd.DataFrame(found)[[column.name for column in COVARIANCE_COLUMNS]]
+        larger, wider = calibration.scores[name]
+        mean = larger * core[name].to_numpy()
+        spread = reach * wider * core[f"{name}_sd"].to_numpy()
+        found += [mean, np.maximum(mean - spread, 0.0), mean + spread]
+    names = [column.name for column in COVARIANCE_COLUMNS]
+    return pd.DataFrame(np.column_stack(found), core.index, names)
 
 
 def calibrate_covariance(core: pd.DataFrame, labels: pd.DataFrame, width: float) -> Calibration:
@@ -206,9 +202,10 @@ def calibrate_covariance(core: pd.DataFrame, labels: pd.DataFrame, width: float)
     lost = float((labels["near_p_fail"].to_numpy() - core["p_lost"].to_numpy()).mean())
     scores = {}
     for name in SCORES:
-        times = labels[f"near_{name}"].to_numpy() / core[name].to_numpy()
-        middle = float(np.median(times))
-        scores[name] = (middle, float(1.4826 * np.median(np.abs(times - middle)) / middle))
+        real, spread = (labels[f"near_{name}{end}"].to_numpy() for end in ("", "_sd"))
+        times = float(np.median(real / core[name]))
+        off = ((real - times * core[name]) ** 2 + spread**2) / core[f"{name}_sd"] ** 2
+        scores[name] = (times, float(np.sqrt(off.mean())))
     return Calibration(scale, added, lost, scores, width, len(core))
 
 
