@@ -39,12 +39,13 @@ from scipy.stats import chi2, rankdata
 from tilestream.label import FAILED, NEAR
 from tilestream.model.bootstrap import resampled, span
 from tilestream.model.covariance import (
+    BIAS,
     ELEMENTS,
+    about_bias,
     calibrated,
-    calibration_of,
-    cores_of,
     matrices,
 )
+from tilestream.model.covariance_training import calibration_of, cores_of
 from tilestream.model.dataset import Dataset
 from tilestream.model.splits import leave_path_out
 from tilestream.moments import AXES, PAIRS
@@ -86,8 +87,10 @@ def held_out(dataset: Dataset, prediction_error: float) -> pd.DataFrame:
         here = calibrated(core.iloc[split.test], known)
         parts.append(here.assign(**one, width=known.width))
         told = ", ".join(
-            f"{axis} {scale:.2f} + ({1e3 * added**0.5:.1f})^2"
-            for axis, scale, added in zip(AXES, known.scale, known.added, strict=True)
+            f"{axis} {gain:.2f}, {scale:.2f} + ({1e3 * added**0.5:.1f})^2"
+            for axis, gain, scale, added in zip(
+                AXES, known.gain, known.scale, known.added, strict=True
+            )
         )
         print(f"without {split.name}: width {known.width}, {told} [mm, mrad]")
     return pd.concat(parts).reindex(dataset.rows.index)
@@ -99,7 +102,8 @@ def normalised(
     """A row per place: mean over its starts of the error squared / variance per axis, and the share
     of them in each ellipse, of ours and of the constant.
     """
-    ours = matrices(places)
+    ours, inner = matrices(places), about_bias(places)
+    bias = places[list(BIAS)].to_numpy()
     ones = matrices(places[[f"one_{e}" for e in ELEMENTS]].set_axis(list(ELEMENTS), axis=1))
     rows = []
     for k, (group, sample) in enumerate(
@@ -108,17 +112,25 @@ def normalised(
         errors = starts.get((group, int(sample)))
         row: dict[str, float] = {}
         if errors is not None and np.isfinite(ours[k]).all():
-            for name, covariance in (("ours", ours[k]), ("one", ones[k])):
+            for name, off, covariance in (
+                ("ours", errors, ours[k]),
+                ("about the expected error", errors - bias[k], inner[k]),
+                ("one", errors, ones[k]),
+            ):
                 for i, axis in enumerate(AXES):
-                    row[f"{name} {axis}"] = float((errors[:, i] ** 2).mean() / covariance[i, i])
+                    row[f"{name} {axis}"] = float((off[:, i] ** 2).mean() / covariance[i, i])
                 flat = np.linalg.inv(covariance[:2, :2])
-                far = np.einsum("ki,ij,kj->k", errors[:, :2], flat, errors[:, :2])
+                far = np.einsum("ki,ij,kj->k", off[:, :2], flat, off[:, :2])
                 for level in LEVELS:
                     row[f"{name} {level:.0%}"] = float((far <= chi2.ppf(level, 2)).mean())
                 row[f"{name} surprise"] = float(
                     np.linalg.slogdet(covariance[:2, :2])[1] + far.mean()
                 )
-            row["gain"] = row["one surprise"] - row["ours surprise"]
+            for i, axis in enumerate(AXES[:3]):
+                row[f"square {axis}"] = float((errors[:, i] ** 2).mean())
+                row[f"square {axis}, expected error taken"] = float(
+                    ((errors[:, i] - bias[k, i]) ** 2).mean()
+                )
         rows.append(row)
     return pd.DataFrame(rows, index=dataset.rows.index)
 

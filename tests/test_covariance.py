@@ -16,9 +16,9 @@ from tilestream.factors.virtual_drive import MOMENT_COLUMNS, Ends, stratified_st
 from tilestream.label import start_errors
 from tilestream.model.covariance import (
     COVARIANCE_COLUMNS,
+    about_bias,
     as_it_is,
     as_json,
-    calibrate_covariance,
     calibrated,
     cores,
     from_json,
@@ -26,6 +26,7 @@ from tilestream.model.covariance import (
     matrices,
     ring_weights,
 )
+from tilestream.model.covariance_training import calibrate_covariance
 from tilestream.model.file import load_model, save_model
 from tilestream.model.training import train
 from tilestream.moments import AXES, PAIRS, moments_of, scores_of
@@ -120,9 +121,12 @@ def test_a_covariance_is_one(seed: int, width: float) -> None:
     table = street(seed, 6, lost=0.1)
     rng = np.random.default_rng(seed)
     calibration = replace(as_it_is(width), scale=rng.uniform(0.1, 3.0, 6), added=SPREAD**2)
+    calibration = replace(calibration, gain=rng.uniform(0.0, 1.0, 6))
     found = calibrated(cores(table, 0.3, width), calibration)
     assert list(found) == NAMES
     whole = matrices(found)
+    inner = about_bias(found) / np.sqrt(np.einsum("i,j->ij", SPREAD, SPREAD))
+    assert (np.linalg.eigvalsh(inner) > 0.0).all()
     np.testing.assert_array_equal(whole, whole.transpose(0, 2, 1))
     assert (np.linalg.eigvalsh(whole / np.sqrt(np.einsum("i,j->ij", SPREAD, SPREAD))) > 0.0).all()
     assert (found["nvtl_low"] < found["nvtl"]).all()
@@ -178,6 +182,7 @@ def test_a_calibration_finds_what_real_scans_add() -> None:
     core = cores(table, 0.3, 0.0)
     found = calibrate_covariance(core, labels, 0.0)
     assert found.places == 400
+    assert (found.gain <= 0.3).all(), "errors without a bias"
     variance = found.scale * SPREAD**2 + found.added
     np.testing.assert_allclose(variance, more.sum(axis=0) * SPREAD**2, rtol=0.1)
     np.testing.assert_allclose(found.scale, more[0], rtol=0.25, atol=0.1)
@@ -195,6 +200,7 @@ def test_a_calibration_is_kept_to_the_bit_and_a_damaged_one_refused() -> None:
     assert as_json(again) == as_json(found)
     for name, value in (
         ("scale", [1.0] * 5),
+        ("gain", [-0.1] * 6),
         ("added", [-1.0] * 6),
         ("width", 0.7),
         ("lost", math.nan),
@@ -217,3 +223,39 @@ def test_a_model_learns_it_and_its_file_keeps_it(tmp_path: Path) -> None:
         replace(known, rows=known.rows.drop(columns="near_along_along")), recipe="physics"
     )
     assert blind.covariance is None
+
+
+def test_a_bias_that_the_map_shows_is_expected_and_taken_from_the_spread() -> None:
+    """Registrations of a place all end off by much the same, virtual and real."""
+    rng = np.random.default_rng(8)
+    rows, labels = [], []
+    for k in range(300):
+        bias = rng.normal(0.0, 2.0, 6) * SPREAD
+        draws = []
+        for _ in range(5):
+            one = draw(rng)
+            axes = one.axes + bias
+            draws.append(replace(one, axes=axes, error=np.linalg.norm(axes[:, :3], axis=1)))
+        rows.append(row(*draws, sample=k, arc=2.0 * k))
+        axes = rng.normal(0.0, 1.0, (40, 6)) * SPREAD + 0.8 * bias
+        held = np.linalg.norm(axes[:, :3], axis=1) <= 0.5
+        scores = scores_of("near", np.full(40, 2.0), np.full(40, 5.0), held)
+        labels.append(moments_of("near", axes, held) | scores)
+    core, measured = cores(pd.DataFrame(rows), 0.3, 0.0), pd.DataFrame(labels)
+    found = calibrate_covariance(core, measured, 0.0)
+    np.testing.assert_allclose(found.gain, 0.8, atol=0.05)
+    after = calibrated(core, found)
+    whole, inner = (
+        np.sqrt(m[:, range(6), range(6)].mean(axis=0)) for m in (matrices(after), about_bias(after))
+    )
+    np.testing.assert_allclose(inner, SPREAD, rtol=0.1)
+    np.testing.assert_allclose(whole, np.sqrt(1.0 + (0.8 * 2.0) ** 2) * SPREAD, rtol=0.1)
+    for axis in AXES:
+        square = measured[f"near_{axis}_{axis}"] / after[f"cov_{axis}_{axis}"]
+        assert square.mean() == pytest.approx(1.0, abs=0.1)
+
+
+def test_untrained_it_is_the_moments_of_the_virtual_drive() -> None:
+    core = cores(street(3, 5), 0.3, 1.5)
+    found = calibrated(core, as_it_is(1.5))
+    np.testing.assert_allclose(matrices(found), matrices(core), atol=1e-15)

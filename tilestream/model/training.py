@@ -13,7 +13,8 @@ from threadpoolctl import threadpool_limits
 from tilestream.errors import ModelError, UsageError
 from tilestream.factors.own import OWN
 from tilestream.model.card import JUDGED, card_of
-from tilestream.model.covariance import Calibration, calibration_of
+from tilestream.model.covariance import Calibration
+from tilestream.model.covariance_training import calibration_of
 from tilestream.model.dataset import TARGETS, Dataset, matrix
 from tilestream.model.domain import WIDEST, Domain, domain_of
 from tilestream.model.explain import PIECE, Typical, compared, in_words, typical_of
