@@ -139,7 +139,7 @@ def figures(
     rows: pd.DataFrame, places: pd.DataFrame, found: pd.DataFrame
 ) -> dict[str, tuple[float, float, float]]:
     """Means over places with the ends of their intervals; ranks of deviations beside."""
-    good = found.notna().all(axis=1).to_numpy()
+    good = found.notna().all(axis=1).to_numpy()  # a place where nothing holds has no covariance
     rows, places, found = rows[good], places[good], found[good]
     _, block = np.unique(rows["piece"], return_inverse=True)
     counts = resampled(int(block.max()) + 1)

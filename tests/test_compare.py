@@ -16,7 +16,8 @@ from report_json import charts, source
 from scenes import PLACES
 
 import tilestream as ts
-from tilestream.apps.compare import Choice, choices_of, compare, plan_compare
+from tilestream.apps.choices import Choice, choices_of
+from tilestream.apps.compare import compare, plan_compare
 from tilestream.cli import run
 from tilestream.errors import UsageError
 from tilestream.formats.points.pcd import write_pcd

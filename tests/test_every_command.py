@@ -75,6 +75,10 @@ def test_a_real_drive(name: str, shared_data: Path, tmp_path: Path, command: Com
     alone = ["estimate", log, "--every", "2", *vehicle, "--spacing", "20", "--model", "physics"]
     answer = command.found(*alone, "--workers", "1", "--out", tmp_path / "e")
     assert answer["headline"]["estimated"] == answer["headline"]["places"] > 2
+    advised = command.found("advise", tmp_path / "e", "--threshold", "9")
+    assert advised["stretches"] == []
+    wanted = ["export", "covariance", tmp_path / "e", "--format", "autoware"]
+    assert command.found(*wanted)["places"] == answer["headline"]["places"]
     assert answer["worth"]["checked"] == "nowhere"
 
     job = {

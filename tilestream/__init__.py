@@ -26,8 +26,12 @@ from typing import TYPE_CHECKING, Any
 from tilestream.version import VERSION
 
 if TYPE_CHECKING:
-    from tilestream.apps.compare import Choice, choices_of, compare
+    from tilestream.apps.advise import Advice, advise
+    from tilestream.apps.choices import Choice, choices_of
+    from tilestream.apps.compare import compare
+    from tilestream.apps.covariances import Covariances, covariances
     from tilestream.apps.diff import diff
+    from tilestream.apps.export.covariance import export
     from tilestream.apps.info import info
     from tilestream.apps.runs import Run, open_run, read_run
     from tilestream.apps.verbs import demo, plan, simulate, status, template
@@ -68,9 +72,11 @@ __all__ = [
     "HDL64",
     "OS1_128",
     "VLP16",
+    "Advice",
     "Cells",
     "Choice",
     "Column",
+    "Covariances",
     "LocalizationError",
     "LogOptions",
     "RegistrationSettings",
@@ -85,15 +91,18 @@ __all__ = [
     "TileKey",
     "TileStore",
     "VirtualSettings",
+    "advise",
     "cells_of",
     "choices_of",
     "compare",
+    "covariances",
     "dataset",
     "demo",
     "diff",
     "disc_starts",
     "estimate",
     "explain",
+    "export",
     "factors",
     "factors_along",
     "info",
@@ -127,8 +136,12 @@ __all__ = [
 ]
 
 _LATE = {
-    "apps.compare": ("Choice", "choices_of", "compare"),
+    "apps.advise": ("Advice", "advise"),
+    "apps.choices": ("Choice", "choices_of"),
+    "apps.compare": ("compare",),
+    "apps.covariances": ("Covariances", "covariances"),
     "apps.diff": ("diff",),
+    "apps.export.covariance": ("export",),
     "apps.info": ("info",),
     "apps.runs": ("Run", "open_run", "read_run"),
     "apps.verbs": ("demo", "plan", "simulate", "status", "template"),

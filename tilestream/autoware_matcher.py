@@ -42,6 +42,7 @@ GROUPS = (
     "validation",
     "score_estimation",
     "covariance",
+    "covariance_by_place",
     "dynamic_map_loading",
 )
 """Groups of keys without effect on where a registration from a given start ends."""

@@ -95,11 +95,12 @@ def read_run(place: str | os.PathLike[str]) -> pd.DataFrame:
         return table
     geopandas = import_module("geopandas")
     points = geopandas.points_from_xy(table["x"], table["y"], table["z"])
-    found: pd.DataFrame = geopandas.GeoDataFrame(table, geometry=points, crs=_crs(place))
+    found: pd.DataFrame = geopandas.GeoDataFrame(table, geometry=points, crs=crs_of_map(place))
     return found
 
 
-def _crs(place: str | os.PathLike[str]) -> str | None:
+def crs_of_map(place: str | os.PathLike[str]) -> str | None:
+    """The CRS of the map of a run; None: it names none, or is gone."""
     try:
         return map_of(place).settings.crs
     except StoreNotFoundError:
@@ -150,12 +151,21 @@ def _labels(place: str | os.PathLike[str]) -> pd.DataFrame:
 
 def _otherwise(place: str | os.PathLike[str]) -> list[str]:
     """The drives of a job that are observed with another lidar than the vehicle's."""
+    settings = settings_of(place)
+    return [] if settings is None else seen_otherwise(settings, settings.drives)
+
+
+def settings_of(place: str | os.PathLike[str]) -> RunSettings | None:
+    """The settings of the job that a run directory is of; None: of tables alone there are none.
+
+    Raises:
+        UsageError: they are of no job of this version.
+    """
     config = Files.at(place).under("config.yaml")
     if not config.there():
-        return []
+        return None
     with foreign_errors(UsageError, f"{config.address}: no job", "give a run directory of ours"):
-        settings = RunSettings(**parse_yaml(config.read().decode("utf-8")))
-    return seen_otherwise(settings, settings.drives)
+        return RunSettings(**parse_yaml(config.read().decode("utf-8")))
 
 
 def with_labels(places: pd.DataFrame, labels: pd.DataFrame) -> pd.DataFrame:

@@ -85,6 +85,14 @@ COMMANDS = {
         "maps",
         "What a map update changes: tiles, and how much road got worse, where and why.",
     ),
+    "advise": (
+        "advising",
+        "What would mend the poor stretches of a run: cells, range, lidar, first guess.",
+    ),
+    "export": (
+        "exporting",
+        "Write the covariance of a registration at every place, for a filter or for Autoware.",
+    ),
     "view": (
         "viewing",
         "Show a map in 3D, the route on it coloured by measured or estimated error.",

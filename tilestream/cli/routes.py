@@ -7,6 +7,7 @@ import pandas as pd
 import typer
 
 from tilestream.apps import compare as comparing
+from tilestream.apps.choices import choices_of
 from tilestream.cli.cluster import HERE, Cluster, on_cluster
 from tilestream.cli.fields import fields, flag, options_named, was_given, with_settings
 from tilestream.cli.options import AsJson, DryRun, Routes, StoreUrl, numbers, routes_of
@@ -293,7 +294,7 @@ def compare(
         say_notes({MATCHER: registration.notes})
         own = None if was_given(context, "cell_size") else registration.resolution
         with options_named({name: flag(name) for name in OF_CHOICES}):
-            choices = comparing.choices_of(
+            choices = choices_of(
                 [sensor_of(name) for name in sensor],
                 numbers(ranges, "--range-max") or (None,),
                 numbers(blind_rear, "--blind-rear-deg"),

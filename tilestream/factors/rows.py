@@ -119,6 +119,23 @@ def samples_of_drive(
     return _by_tile(grid, [(name, rows)])
 
 
+def samples_of_places(grid: TileGrid, places: pd.DataFrame) -> dict[TileKey, Samples]:
+    """Sample points that a table has, by the tile that holds them; their z is that of the lidar
+    (`RouteZ`).
+
+    Args:
+        grid: the tiles.
+        places: a row each, along each route: `PLACE_COLUMNS`, but for `above_ground`.
+    """
+    named = []
+    for name, part in places.groupby("route_id", sort=False):
+        rows = np.zeros(len(part), ROW)
+        for column in ("sample", "arc_length", "heading", "x", "y", "z"):
+            rows[column] = part[column]
+        named.append((str(name), rows))
+    return _by_tile(grid, named)
+
+
 def _by_tile(
     grid: TileGrid, named: Iterable[tuple[str, NDArray[np.void]]]
 ) -> dict[TileKey, Samples]:

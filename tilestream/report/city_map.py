@@ -21,6 +21,7 @@ from tilestream.from_above import FromAbove
 from tilestream.records import Float64, Int64
 from tilestream.report.charts import finish, hover, item, new_plot
 from tilestream.report.colours import HERE, MISSING, Scale
+from tilestream.report.covariance import registrations_told
 from tilestream.report.data import Findings, estimates, like_training
 from tilestream.report.formatting import CM_PER_M, cm, cm_about, cm_by_name, cm_span, percent
 from tilestream.report.lines import points_per_mark, worst_of_every
@@ -212,6 +213,7 @@ def _columns(found: Findings, rows: Int64, origin: Float64) -> dict[str, Any]:
         "starts": [cm_by_name(of, STARTS) for of in figures],
         "domain": like_training(part).tolist(),
         "reason": part["reason"].fillna("").astype(str).tolist(),
+        **registrations_told(part),
     }
 
 

@@ -69,21 +69,33 @@ def geojson(
     Raises:
         CrsError: PROJ knows no way from the CRS to degrees.
     """
-    placed = at.copy()
-    if crs is not None and len(placed):
-        to_degrees = projection(crs, CRS.from_epsg(4326), "map")
-        placed[:, 0], placed[:, 1] = to_degrees.transform(placed[:, 0], placed[:, 1])
-    degrees = "longitude, latitude (WGS 84); z as in the map [m]"
+    placed, coordinates = as_geojson_has(at, crs)
     return {
         "type": "FeatureCollection",
         "name": name,
         **members,
-        "coordinates": degrees if crs is not None else "map frame [m]; the map names no CRS",
+        "coordinates": coordinates,
         "features": [
             {"type": "Feature", "properties": dict(told), "geometry": _geojson_line(placed[rows])}
             for rows, told in lines
         ],
     }
+
+
+def as_geojson_has(at: Float64, crs: CRS | None) -> tuple[Float64, str]:
+    """Positions (n, 2 or 3) of a map [m] as longitude, latitude (and z), and what they are in
+    words; of a map without a CRS as they are.
+
+    Raises:
+        CrsError: PROJ knows no way from the CRS to degrees.
+    """
+    if crs is None:
+        return at, "map frame [m]; the map names no CRS"
+    placed = at.copy()
+    if len(placed):
+        to_degrees = projection(crs, CRS.from_epsg(4326), "map")
+        placed[:, 0], placed[:, 1] = to_degrees.transform(placed[:, 0], placed[:, 1])
+    return placed, "longitude, latitude (WGS 84); z as in the map [m]"
 
 
 def _geojson_line(at: Float64) -> dict[str, Any] | None:

@@ -70,9 +70,11 @@ ready.push(() => {
     part("facts").replaceChildren(
       ...fact("estimate", found.shown), ...fact("interval", found.interval), ...fact("by direction", found.axes),
       ...fact("starts", found.starts), ...fact("starts that fail", found.fail),
+      ...fact("95 % ellipse", found.ellipse), ...fact("lost", found.lost), ...fact("NVTL", found.nvtl), ...fact("TP", found.tp),
       ...fact("like the training places", found.domain), ...fact("why", found.reason),
       ...fact("x, y", `${x.toFixed(1)}, ${y.toFixed(1)}`),
     );
+    part("filter").hidden = !found.ellipse;
     part("link").href = `#${address(x, y)}`;
     part("link").hidden = false;
     const around = pictures("figure[data-x]", (of) => Math.hypot(of.x - x, of.y - y) < 0.1);

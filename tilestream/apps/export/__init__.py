@@ -1,0 +1,1 @@
+"""What a run knows, as files that a vehicle's software reads."""

@@ -1,0 +1,96 @@
+"""The command that says what would mend the poor stretches of a run."""
+
+from typing import Annotated, Any
+
+import typer
+from rich.box import SIMPLE
+from rich.table import Table
+
+from tilestream.apps import advise as advising
+from tilestream.cli.cluster import HERE, Cluster, on_cluster
+from tilestream.cli.fields import fields, with_settings
+from tilestream.cli.options import AsJson
+from tilestream.cli.printing import out, print_json, say
+from tilestream.cli.progress import progress
+from tilestream.pipeline.engine.plan import DEFAULT_MEMORY
+from tilestream.report.formatting import cm, distance
+from tilestream.report.summary import plain
+from tilestream.settings import ReportSettings
+
+
+@on_cluster
+@with_settings
+def advise(
+    run: Annotated[str, typer.Argument(help="A run directory: `estimate`, `run`.")],
+    report: Annotated[ReportSettings, fields("threshold")],
+    folder: Annotated[
+        str | None,
+        typer.Option("--out", help="Folder of the tables.", show_default="RUN/advise"),
+    ] = None,
+    as_json: AsJson = False,
+    cluster: Cluster = HERE,
+) -> None:
+    """What would mend the poor stretches of a run: cells, range, lidar, first guess.
+
+    From the map alone: the virtual drive of some places of each stretch, once per remedy. Smaller
+    cells are kept in the tile store of the map.
+    """
+    with cluster.client(DEFAULT_MEMORY) as client, progress() as watch:
+        found = advising.advise(run, folder, threshold=report.threshold, client=client, watch=watch)
+    if as_json:
+        print_json(content_of(found))
+        return
+    if found.stretches.empty:
+        say(f"No estimate is above {cm(found.threshold, 0)}: there is nothing to mend")
+        return
+    out.print(advice_table(found))
+    for row in found.stretches.to_dict("records"):
+        say(f"{row['route']}, {row['begin_m']:.0f} to {row['end_m']:.0f} m: {verdict(found, row)}")
+    for name, why in found.left_out.items():
+        say(f"Not tried: {name}, {why}")
+
+
+def content_of(found: advising.Advice) -> dict[str, Any]:
+    """Advice for machines."""
+    stretches = [
+        row
+        | {"verdict": verdict(found, row)}
+        | {"remedies": of.drop(columns="stretch").to_dict("records")}
+        for number, row in enumerate(found.stretches.to_dict("records"))
+        for of in [found.remedies[found.remedies["stretch"] == number]]
+    ]
+    content = {"threshold_m": found.threshold, "stretches": stretches, "not_tried": found.left_out}
+    return dict(plain(content))
+
+
+def verdict(found: advising.Advice, row: Any) -> str:
+    """What to do about a stretch, in words."""
+    if not row["best"]:
+        return (
+            "none of these helps clearly: the lidar does not tell the position here, other sensors "
+            "have to"
+        )
+    change = f"{row['best']}: {cm(row['now_m'], 0)} to {cm(row['best_m'], 0)}"
+    limit = cm(found.threshold, 0)
+    told = f"{change}, {'within' if row['mends'] else 'still over'} {limit}"
+    return " ".join(told.split())  # plain spaces
+
+
+def advice_table(found: advising.Advice) -> Table:
+    """The stretches, and below each a line per remedy."""
+    table = Table(
+        title="estimates as it is, and with each remedy", title_justify="left", box=SIMPLE
+    )
+    table.add_column("route")
+    for column in ("from", "length"):
+        table.add_column(column, justify="right", no_wrap=True)
+    table.add_column("remedy", no_wrap=True)
+    table.add_column("estimate", justify="right", no_wrap=True)
+    table.add_column("")
+    for number, row in enumerate(found.stretches.to_dict("records")):
+        where = (str(row["route"]), f"{row['begin_m']:.0f} m", distance(row["length_m"]))
+        table.add_row(*where, "as it is", cm(row["now_m"], 0), "")
+        for one in found.remedies[found.remedies["stretch"] == number].to_dict("records"):
+            clear = "" if one["helps"] else "unclear"
+            table.add_row("", "", "", str(one["remedy"]), cm(one["after_m"], 0), clear)
+    return table
