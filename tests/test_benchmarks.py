@@ -50,6 +50,7 @@ SMALLEST = (
 OF_A_FINISHED_RUN = (
     "drive_estimate.py drive",
     "experiment.py city",
+    "filter.py city drive --train city --seeds 2 --train-seeds 1",
     "over_runs.py retrained --competitors physics",
     "page.py city --places 20",
     "predict.py --run city",

@@ -91,12 +91,6 @@ def inputs_of(settings: RunSettings, client: Any | None, watch: Watch | None) ->
     wanted = settings.simulate
     for drive in simulations(wanted):
         simulate(drive, folder, **extent(wanted), client=client, watch=watch)
-    logs = [
-        DriveSettings(log=str(log), name=f"drive{drive}-{log.stem}")
-        for drive in range(wanted.drives)
-        for log in sorted((folder / "logs" / f"drive{drive}").glob("*.mcap"))
-        if wanted.paths is None or log.stem in wanted.paths
-    ]
     preset = load_preset(wanted.preset)
     surveyed = Path(wanted.survey_of) if wanted.survey_of else folder
     sources = settings.map.sources or (str(surveyed / "survey" / "*.laz"),)
@@ -107,7 +101,7 @@ def inputs_of(settings: RunSettings, client: Any | None, watch: Watch | None) ->
         read = replace(read, routes=asked)
     inputs = _inputs(
         sources,
-        settings.drives or tuple(logs),
+        drives_of(settings),
         read.at_least(settings.spacing),
         files,
         {JOB: [f"simulated, preset {preset.preset}: {preset.note}"]},
@@ -161,6 +155,19 @@ ATTRIBUTION = (
     "Building footprints: MLIT Project PLATEAU by way of indigo-lab/plateau-lod2-mvt, clipped, "
     "CC BY 4.0."
 )
+
+
+def drives_of(settings: RunSettings) -> tuple[DriveSettings, ...]:
+    """The drives of a job; of a simulated city those that are there, where none are given."""
+    wanted = settings.simulate
+    if settings.drives or wanted is None:
+        return settings.drives
+    return tuple(
+        DriveSettings(log=str(log), name=f"drive{drive}-{log.stem}")
+        for drive in range(wanted.drives)
+        for log in sorted((simulated_folder(settings) / "logs" / f"drive{drive}").glob("*.mcap"))
+        if wanted.paths is None or log.stem in wanted.paths
+    )
 
 
 def simulated_folder(settings: RunSettings) -> Path:
