@@ -7,6 +7,7 @@ from rich.box import SIMPLE
 from rich.table import Table
 
 from tilestream.apps import advise as advising
+from tilestream.apps.runs import settings_of
 from tilestream.cli.cluster import HERE, Cluster, on_cluster
 from tilestream.cli.fields import fields, with_settings
 from tilestream.cli.options import AsJson
@@ -35,7 +36,9 @@ def advise(
     From the map alone: the virtual drive of some places of each stretch, once per remedy. Smaller
     cells are kept in the tile store of the map.
     """
-    with cluster.client(DEFAULT_MEMORY) as client, progress() as watch:
+    settings = settings_of(run)
+    memory = DEFAULT_MEMORY if settings is None else settings.memory
+    with cluster.client(memory) as client, progress() as watch:
         found = advising.advise(run, folder, threshold=report.threshold, client=client, watch=watch)
     if as_json:
         print_json(content_of(found))

@@ -91,7 +91,7 @@ COMMANDS = {
     ),
     "export": (
         "exporting",
-        "Write the covariance of a registration at every place, for a filter or for Autoware.",
+        "Write the covariance of a registration at every place, and the poor stretches.",
     ),
     "view": (
         "viewing",

@@ -47,7 +47,7 @@ def export(
     ] = exported.LOST,
     as_json: AsJson = False,
 ) -> None:
-    """Write the covariance of a registration at every place for a filter, and the poor stretches.
+    """Write the covariance of a registration at every place, and the poor stretches.
 
     - `tilestream export covariance run --format csv`: a row per place, 36 numbers in ROS's order,
       map frame
