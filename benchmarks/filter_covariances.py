@@ -18,6 +18,7 @@ from tilestream.model.covariance import (
     about_bias,
     calibrated,
     cores,
+    errors_in_map,
     in_map,
     matrices,
 )
@@ -179,7 +180,7 @@ class Learnt:
             "true, other scans": _true(drive, own=False),
             "constant, true": np.tile(_mean(labels), (len(heading), 1, 1)),
         }
-        bias = {WITHOUT_BIAS: _turned(core[list(BIAS)].fillna(0.0).to_numpy(), heading)}
+        bias = {WITHOUT_BIAS: errors_in_map(core[list(BIAS)].fillna(0.0).to_numpy(), heading)}
         return {
             name: Believed(in_map(_filled(table, constant), heading), bias.get(name))
             for name, table in found.items()
@@ -196,16 +197,6 @@ def learnt_from(dataset: Dataset) -> Learnt:
     if calibration is None:
         raise ModelError("no labels with moments to train on: run the training jobs again")
     return Learnt(_mean(dataset.rows), calibration)
-
-
-def _turned(errors: Floats, heading: Floats) -> Floats:
-    """(n, 6) errors in the map frame, of those in the frame of the route."""
-    c, s = np.cos(heading), np.sin(heading)
-    found = errors.copy()
-    for k in (0, 3):
-        found[:, k] = c * errors[:, k] - s * errors[:, k + 1]
-        found[:, k + 1] = s * errors[:, k] + c * errors[:, k + 1]
-    return found
 
 
 def _mean(labels: pd.DataFrame) -> Floats:

@@ -56,6 +56,8 @@ def covariance_tables() -> tuple[pd.DataFrame, pd.DataFrame]:
     said.loc[20:24, "estimate"] = 0.4
     for a, b in PAIRS:
         said[f"cov_{a}_{b}"] = matrix[:, AXES.index(a), AXES.index(b)]
+    for axis in AXES:
+        said[f"bias_{axis}"] = rng.normal(0.0, 0.01, count)
     said["p_lost"] = rng.uniform(0.0, 0.04, count)
     said.loc[100, "p_lost"] = 0.2
     for name, mean in (("nvtl", 3.0), ("tp", 5.0)):
@@ -115,6 +117,9 @@ def test_covariances_are_those_of_the_tables_in_both_frames(run: Path) -> None:
     np.testing.assert_allclose(along, said["cov_along_along"], rtol=1e-9)
     yaw = said["cov_yaw_vector_yaw_vector"]
     np.testing.assert_allclose(found.in_map[:, 5, 5], yaw, rtol=1e-9)
+    ahead_of_it = np.einsum("ni,ni->n", ahead, found.bias_in_map)
+    np.testing.assert_allclose(ahead_of_it, said["bias_along"], atol=1e-15)
+    np.testing.assert_array_equal(found.bias[:, 5], found.bias_in_map[:, 5])
     assert set(found.correlations) == {*AXES, POOLED}
 
 
@@ -159,6 +164,8 @@ def test_a_row_of_the_table_is_a_place_in_the_order_of_ros(run: Path, tmp_path: 
     assert [table.columns.get_loc(name) - first for name in named] == [3, 35]
     flat = table.iloc[:, first : first + 36].to_numpy()
     np.testing.assert_array_equal(flat.reshape(-1, 6, 6), found.in_map)  # to the bit
+    expected = table.loc[:, "map_bias_x_m":"map_bias_yaw_rad"].to_numpy()
+    np.testing.assert_array_equal(expected, found.bias_in_map)
     assert table["map_x_m"].tolist() == found.places["x"].tolist()
     assert "'=way" in set(table["route"])  # no formula for a spreadsheet
     again = exported(run, tmp_path / "b.csv")
@@ -173,6 +180,7 @@ def test_json_has_all_with_meanings(run: Path, tmp_path: Path) -> None:
     row, last = content["sample_points"][5], content["sample_points"][PLACES - 1]
     assert row["covariance_map"] == found.in_map[5].ravel().tolist()
     assert row["covariance_route"] == found.route[5].ravel().tolist()
+    assert row["bias_map"] == found.bias_in_map[5].tolist()
     assert last["covariance_map"] == [None] * 36
     assert set(content["correlation"]) == {*AXES, POOLED}
     assert content["correlation"][POOLED]["inflation"] == content["inflation"]
@@ -251,6 +259,7 @@ def test_autowares_file_is_of_doubles_in_its_own_names(run: Path, tmp_path: Path
     ours = "covariance_by_place"
     assert len(given[f"{ours}.position"]) == 3 * count
     assert len(given[f"{ours}.output_pose_covariance"]) == 36 * count
+    assert len(given[f"{ours}.expected_error"]) == 6 * count
     assert [len(given[f"{ours}.{n}"]) for n in ("nvtl_low", "tp_low", "p_lost")] == [count] * 3
 
 

@@ -12,7 +12,13 @@ from tilestream.apps.runs import PLACE, places_of
 from tilestream.errors import SourceNotFoundError, UsageError
 from tilestream.files import Files
 from tilestream.model.correlation import Correlation, correlations
-from tilestream.model.covariance import COVARIANCE_COLUMNS, in_map, matrices
+from tilestream.model.covariance import (
+    BIAS,
+    COVARIANCE_COLUMNS,
+    errors_in_map,
+    in_map,
+    matrices,
+)
 from tilestream.moments import AXES, PAIRS
 from tilestream.pipeline.jobs.run_folder import job_of, rows_of
 from tilestream.records import Float64
@@ -41,7 +47,9 @@ class Covariances:
 
     @property
     def route(self) -> Float64:
-        """(n, 6, 6) along, across, up [m], and the rotation vector about these axes [rad]."""
+        """(n, 6, 6) about the truth: along, across, up [m], and the rotation vector about these
+        axes [rad].
+        """
         return matrices(self.places)
 
     @property
@@ -50,6 +58,18 @@ class Covariances:
         `PoseWithCovariance`, whose fixed axes are the map's.
         """
         return in_map(self.route, self.places["heading"].to_numpy(np.float64))
+
+    @property
+    def bias(self) -> Float64:
+        """(n, 6) errors that are expected, as of `route` [m, rad]: a filter that takes them from
+        its registrations has the covariance `route` - bias bias^T.
+        """
+        return self.places[list(BIAS)].to_numpy(np.float64)
+
+    @property
+    def bias_in_map(self) -> Float64:
+        """(n, 6) the same, as of `in_map`."""
+        return errors_in_map(self.bias, self.places["heading"].to_numpy(np.float64))
 
     @cached_property
     def correlations(self) -> Mapping[str, Correlation]:
@@ -82,12 +102,12 @@ def covariances(place: str | os.PathLike[str]) -> Covariances:
     if "estimate" not in places:
         raise UsageError(f"{place}: has no estimates: give a run of `run` or `estimate`")
     error = job_of(Files.at(place)).get("prediction_error")
-    if error is None or COLUMNS[0] not in places:
+    if error is None or "cov_along_along" not in places:
         raise UsageError(
             f"{place}: its estimates are of a version without covariances: give the command that "
             "made it again"
         )
-    if places[COLUMNS[0]].isna().all():
+    if places["cov_along_along"].isna().all():
         raise UsageError(
             f"{place}: no place has a covariance: it comes from virtual drives, which this run has "
             "not, or nothing holds in them; `tilestream estimate` makes them"

@@ -230,11 +230,23 @@ def in_map(route: Float64, heading: Float64) -> Float64:
     """(n, 6, 6) covariances in the map frame (x, y, z, rotation vector) from those in that of the
     route (along, across, up, rotation vector), whose `heading` (n,) is from the map's x axis [rad].
     """
+    turn = _turn(heading)
+    turned: Float64 = np.einsum("nij,njk,nlk->nil", turn, route, turn)
+    return turned
+
+
+def errors_in_map(route: Float64, heading: Float64) -> Float64:
+    """(n, 6) errors in the map frame from those in that of the route, as `in_map`."""
+    turned: Float64 = np.einsum("nij,nj->ni", _turn(heading), route)
+    return turned
+
+
+def _turn(heading: Float64) -> Float64:
+    """(n, 6, 6) from the frame of the route to that of the map, position and rotation alike."""
     c, s = np.cos(heading), np.sin(heading)
     turn = np.zeros((len(heading), 6, 6))
     for at in (0, 3):
         turn[:, at, at] = turn[:, at + 1, at + 1] = c
         turn[:, at, at + 1], turn[:, at + 1, at] = -s, s
         turn[:, at + 2, at + 2] = 1.0
-    turned: Float64 = np.einsum("nij,njk,nlk->nil", turn, route, turn)
-    return turned
+    return turn

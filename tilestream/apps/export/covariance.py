@@ -44,7 +44,8 @@ def export(
 
     * `csv`: a row per place: route, arc length, position, heading, the 36 numbers of the covariance
       in the order of ROS (x, y, z, and turns about the fixed axes of the map: roll, pitch, yaw; row
-      by row), `p_lost`, and the scores of a normal registration; names say frame and unit.
+      by row), the six expected errors, `p_lost`, and the scores of a normal registration; names say
+      frame and unit.
     * `json`: the same in the frames of map and route, with meanings, units, CRS, what the estimates
       are worth, the correlation along the route, and the poor stretches as areas (GeoJSON).
     * `autoware`: a ROS 2 parameter file that `ndt_scan_matcher` loads after its own: one constant
@@ -130,6 +131,8 @@ def _made(
         places,
         found.route[chosen] * times,
         found.in_map[chosen] * times,
+        found.bias[chosen],
+        found.bias_in_map[chosen],
         float(spacing),
         every,
         inflation,

@@ -36,7 +36,8 @@ MEANT = (
     "They are of a registration that starts where a filter predicts the vehicle, off by {:g} m "
     "(standard deviation in map x and in y), and that ends within 0.5 m of the truth; p_lost is "
     "the share of those that end farther away. They are of the pose of the lidar (of several: of "
-    "the frame of their mounts), about the truth: a bias counts."
+    "the frame of their mounts), about the truth: a bias counts. A filter that takes the expected "
+    "error e (bias) from its registrations has this covariance - e e^T."
 )
 """What the covariances are of."""
 
@@ -51,6 +52,10 @@ class CovarianceExport:
     route: Float64
     """(n, 6, 6) their covariances, as they are exported, …"""
     in_map: Float64
+    """… and in the map frame."""
+    bias: Float64
+    """(n, 6) the errors that are expected, in the frame of the route, …"""
+    bias_in_map: Float64
     """… and in the map frame."""
     spacing: float
     """Of the places along a route [m]."""
@@ -129,7 +134,8 @@ def _write_csv(made: CovarianceExport, file: Files) -> None:
         }
     )
     flat = pd.DataFrame(made.in_map.reshape(-1, 36), columns=ELEMENTS)
-    write_csv(file, pd.concat([table, flat, places[["p_lost", *OF_SCORES]]], axis=1))
+    bias = pd.DataFrame(made.bias_in_map, columns=EXPECTED)
+    write_csv(file, pd.concat([table, flat, bias, places[["p_lost", *OF_SCORES]]], axis=1))
 
 
 def _element(i: int, j: int) -> str:
@@ -138,6 +144,8 @@ def _element(i: int, j: int) -> str:
 
 ELEMENTS = [_element(i, j) for i in range(6) for j in range(6)]
 """Names of the 36 numbers of a covariance."""
+EXPECTED = [f"map_bias_{axis}_{'m' if i < 3 else 'rad'}" for i, axis in enumerate(AXES)]
+"""Names of the six expected errors."""
 
 
 def _write_json(made: CovarianceExport, file: Files) -> None:
@@ -176,6 +184,7 @@ def _write_json(made: CovarianceExport, file: Files) -> None:
             "covariance_map": "6 x 6, row by row: x, y, z [m], turns about the map's fixed x, y, z "
             "axes [rad] (roll, pitch, yaw in ROS's PoseWithCovariance).",
             "covariance_route": "The same along the heading, across (left), up.",
+            "bias_map, bias_route": "The error that is expected, in the order of the covariance.",
             "correlation": "bias: autocorrelation of what two registrations a lag apart share; "
             "share: of the second moment of an error that this is; length_m: where it falls below "
             "1/e, null: not known; inflation: what covariances need to be multiplied by where a "
@@ -184,8 +193,16 @@ def _write_json(made: CovarianceExport, file: Files) -> None:
         "correlation": correlations,
         "areas": areas(places, poor, crs_of(made.crs)),
         "sample_points": [
-            {**row, "covariance_map": in_map.ravel(), "covariance_route": along.ravel()}
-            for row, in_map, along in zip(rows, made.in_map, made.route, strict=True)
+            {
+                **row,
+                "covariance_map": in_map.ravel(),
+                "covariance_route": along.ravel(),
+                "bias_map": expected,
+                "bias_route": own,
+            }
+            for row, in_map, along, expected, own in zip(
+                rows, made.in_map, made.route, made.bias_in_map, made.bias, strict=True
+            )
         ],
     }
     write_json(file, content)
@@ -198,7 +215,12 @@ def _write_autoware(made: CovarianceExport, file: Files) -> None:
     run = Files.at(made.found.run).name
     about = [f"Covariances and scores of the run {run}.", *made.about, *made.worth]
     text = ros_parameters(
-        made.places[known], made.route[known], made.in_map[known], made.spacing, about
+        made.places[known],
+        made.route[known],
+        made.in_map[known],
+        made.bias_in_map[known],
+        made.spacing,
+        about,
     )
     write_text(file, text)
 

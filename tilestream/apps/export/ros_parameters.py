@@ -34,13 +34,19 @@ p = position of the lidar in the map: that of base_link, moved by its mount
 k = the place whose position[3 k .. 3 k + 2] is nearest to p
 if it is nearer than spacing:
     the pose's covariance = output_pose_covariance[36 k .. 36 k + 35]
+    or: the pose - expected_error[6 k .. 6 k + 5] = e, with the covariance - e e^T
     the registration is normal where its NVTL >= nvtl_low[k], or its TP >= tp_low[k]
 else: the constant above"""
 """How a node looks a place up."""
 
 
 def ros_parameters(
-    places: pd.DataFrame, route: Float64, in_map: Float64, spacing: float, about: list[str]
+    places: pd.DataFrame,
+    route: Float64,
+    in_map: Float64,
+    bias: Float64,
+    spacing: float,
+    about: list[str],
 ) -> str:
     """What places say to Autoware's scan matcher, as the text of a YAML file.
 
@@ -51,6 +57,7 @@ def ros_parameters(
         places: those that have a covariance: `x`, `y`, `z`, `p_lost` and the scores.
         route: (n, 6, 6) their covariances in the frame of the route.
         in_map: (n, 6, 6) in the map frame.
+        bias: (n, 6) the errors that are expected, in the map frame.
         spacing: of the places [m].
         about: what else to say above, a line each.
     """
@@ -73,6 +80,7 @@ def ros_parameters(
         "spacing": spacing,
         "position": places[["x", "y", "z"]].to_numpy(np.float64).round(3),
         "output_pose_covariance": in_map,
+        "expected_error": bias,
         **{name: places[name].to_numpy(np.float64) for name in ("nvtl_low", "tp_low", "p_lost")},
     }
     parameters = {
