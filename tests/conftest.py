@@ -49,6 +49,7 @@ LONG = (
     "readme",
     "localize_drive",
     "compare",
+    "advise",
     "info",
     "store",
     "diff_page",
@@ -63,6 +64,7 @@ LONG = (
     "starts_of",
     "pairs",
     "degraded_drives",
+    "export",
 )
 """Files of ten seconds and more, the longest first: what is begun last must be short, or one of
 the processes that the tests run in would wait for another. By default they are left out, so that

@@ -15,10 +15,11 @@ import yaml
 from hand_made_run import put
 from hypothesis import given
 from hypothesis import strategies as st
+from pyproj import CRS, Transformer
 from test_matcher_file import NESTED
 
 import tilestream as ts
-from tilestream.apps.export.poor_stretches import BESIDE, area, poor_stretches
+from tilestream.apps.export.poor_stretches import BESIDE, area, areas, poor_stretches
 from tilestream.autoware_matcher import MATCHER, read_matcher
 from tilestream.cli import run as command
 from tilestream.errors import SourceNotFoundError, UsageError
@@ -341,6 +342,22 @@ def test_a_straight_stretch_is_a_rectangle() -> None:
     assert ring.min(axis=0).tolist() == [-BESIDE, -BESIDE]
     assert ring.max(axis=0).tolist() == [10.0 + BESIDE, BESIDE]
     assert area(at[:1], np.zeros(1)).shape[0] >= 5
+
+
+def test_areas_of_a_map_with_a_crs_are_in_degrees() -> None:
+    said, _ = covariance_tables()
+    said[["x", "y"]] += [380_000.0, 3_950_000.0]
+    crs = CRS.from_epsg(32654)
+    told = areas(said, poor_stretches(said, 0.25, 0.05), crs)
+    assert "WGS 84" in told["coordinates"]
+    back = Transformer.from_crs("EPSG:4326", crs, always_xy=True)
+    for feature in told["features"]:
+        (ring,) = feature["geometry"]["coordinates"]
+        assert ring[0] == ring[-1]
+        longitude, latitude = np.array(ring).T
+        assert (np.abs(longitude - 139.7) < 0.1).all()
+        metres = np.column_stack(back.transform(longitude, latitude))
+        assert metres == pytest.approx(np.array(feature["properties"]["ring"]), abs=2e-3)
 
 
 def test_poor_is_what_errs_or_is_lost() -> None:

@@ -1,5 +1,7 @@
 """Stretches of road on which a filter should not rely on registrations, as areas."""
 
+from typing import Any
+
 import numpy as np
 import pandas as pd
 from pyproj import CRS
@@ -29,7 +31,7 @@ def poor_stretches(places: pd.DataFrame, threshold: float, lost: float) -> list[
     return stretches(places, np.flatnonzero(poor))
 
 
-def areas(places: pd.DataFrame, rows: list[Int64], crs: CRS | None) -> dict[str, object]:
+def areas(places: pd.DataFrame, rows: list[Int64], crs: CRS | None) -> dict[str, Any]:
     """Stretches as a GeoJSON collection of polygons; `ring` of each has its corners in the map
     frame [m].
 

@@ -94,7 +94,9 @@ def ros_parameters(
     }
     comment = "".join(f"# {line}\n" for line in lines)
     node = {"/**": {"ros__parameters": parameters}}
-    return comment + yaml.dump(node, Dumper=yaml.CSafeDumper, sort_keys=False, width=10**9)
+    return comment + yaml.dump(
+        node, Dumper=yaml.CSafeDumper, sort_keys=False, default_flow_style=None
+    )
 
 
 def _constant(route: Float64, in_map: Float64) -> Float64:
