@@ -32,7 +32,9 @@ class Drive:
     name: str
     """`<run>/<group>`."""
     street: str
-    """`<district>/<path>`."""
+    """`<district>/<path>`: none trains where it is tested."""
+    road: str
+    """Equal for drives along one road only: real districts are named by nobody."""
     settings: RunSettings
     """Of its run."""
     reading: Reading
@@ -83,5 +85,7 @@ def drives_in(run: Path) -> list[Drive]:
         own = seen[name].set_index("sample").reindex(labels["sample"]).set_index(labels.index)
         own = own.assign(arc_length=labels["arc_length"], status=own["status"].fillna("missing"))
         own = own.assign(route_id=name)
-        found.append(Drive(name, streets[name], settings, reading_of(drive), labels, own))
+        street = streets[name]
+        road = street if settings.simulate is not None else f"{run.name}/{street}"
+        found.append(Drive(name, street, road, settings, reading_of(drive), labels, own))
     return found

@@ -75,9 +75,9 @@ class Rows:
 
 def rows_of(table: pd.DataFrame, length: float) -> dict[str, Rows]:
     """Of each contestant the rows of `filter_run.run`, in blocks of this length [m]; a block of a
-    street is one in all its drives.
+    road is one in all its drives.
     """
-    name = table["street"] + "/" + (table["arc_length"] // length).astype(int).astype(str)
+    name = table["road"] + "/" + (table["arc_length"] // length).astype(int).astype(str)
     block, names = pd.factorize(name)
     counts = resampled(len(names))
     return {

@@ -55,7 +55,7 @@ def run(
         names = np.repeat([one.name for one in contestants], seeds)
         seed = np.tile(np.arange(seeds), len(contestants))
         rows.append(_table(row).assign(contestant=names, seed=seed, lost=lost, arc_length=arc[i]))
-    return pd.concat(rows, ignore_index=True).assign(drive=drive.name, street=drive.street)
+    return pd.concat(rows, ignore_index=True).assign(drive=drive.name, road=drive.road)
 
 
 def _begun(drive: Drive, odometry: Odometry, seeds: int) -> tuple[Floats, States]:
