@@ -1,11 +1,14 @@
 """What a tile costs as the city grows: time, memory of every process, tasks and graph, overhead.
 
 python benchmarks/scale.py [--tiles 4 16 64 256] [--again 64] [--size 50]
+python benchmarks/scale.py --empty 8000      # tasks that do nothing, encryption off and on
+python benchmarks/scale.py --done 256        # a job again whose tiles are all done
+python benchmarks/scale.py --plan 200000     # planned, written down and read back
 
 A synthetic city (tests/city_tiles.py) is ingested and looked at along all of its streets, on a
 scheduler in a process of its own. CPU time is what the workers, the client and the scheduler used,
 warm, whatever else the machine did; wall times are only good on a quiet machine, so the load is
-printed with them.
+printed with them. With `PYTHONPATH` at another commit, that one is measured.
 """
 
 import argparse
@@ -19,6 +22,9 @@ def options() -> argparse.Namespace:
     parser.add_argument("--tiles", type=int, nargs="+", default=[4, 16, 64, 256])
     parser.add_argument("--again", type=int, default=64, help="also with one worker, this many")
     parser.add_argument("--size", type=float, default=50.0, help="edge of a tile [m]")
+    parser.add_argument("--empty", type=int, help="only so many tasks that do nothing")
+    parser.add_argument("--done", type=int, help="only a job of so many tiles, again")
+    parser.add_argument("--plan", type=int, help="only a plan of so many tiles")
     parser.add_argument("--client", nargs=4, help=argparse.SUPPRESS)
     return parser.parse_args()
 
@@ -40,13 +46,26 @@ from typing import Any
 import psutil
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+import numpy as np
 from city_tiles import run_city, write_city
-from elsewhere import scheduler_elsewhere
+from elsewhere import certificates, scheduler_elsewhere
+from naps import MEMORY, Nap
 
+import tilestream as ts
+from tilestream.formats.routes import route_of
+from tilestream.grid import TileKey
+from tilestream.marks import hash_of
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.cluster import dask_client
+from tilestream.pipeline.engine.executor import execute
 from tilestream.pipeline.engine.frontier import Frontier
+from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan
 from tilestream.pipeline.engine.stage import Task
+from tilestream.pipeline.jobs.along_routes import plan_factors, samples_along
+from tilestream.pipeline.jobs.inventory import announce, inventory_of
+from tilestream.pipeline.stages.factors import Looking
+from tilestream.pipeline.stages.map_plan import MapPlan, TilePoints
+from tilestream.store import Manifest, StoreSettings, TileStore
 
 SPACING = 0.4
 """Of the points of a block [m]."""
@@ -136,6 +155,100 @@ def measure(n: int, workers: int, size: float) -> dict[str, float]:
         }
 
 
+def measure_empty(count: int) -> None:
+    """Tasks that do nothing, four a tile, each after the one before."""
+    chain = ("cells", "terms", "factors", "predict")
+
+    def naps(number: int, row: int) -> Plan:
+        tasks: list[Task] = []
+        for tile in (TileKey(i, row) for i in range(-(-number // len(chain)))):
+            for before, stage in zip(("", *chain), chain, strict=False):
+                tasks.append(Nap(tile, stage, needs=(f"{before}-{tile}",) if before else ()))
+        return Plan(tuple(tasks), MEMORY)
+
+    print("| | tasks/s | CPU ms/task of client | of scheduler | of both workers | load |")
+    print("|---|---|---|---|---|---|")
+    for kind in ("plain", "encrypted"):
+        with tempfile.TemporaryDirectory() as folder:
+            tls = None if kind == "plain" else certificates(Path(folder))
+            with (
+                scheduler_elsewhere(2, tls) as (address, processes),
+                dask_client(address, None, 1, tls=tls) as client,
+            ):
+                client.wait_for_workers(2)
+                execute(naps(200, -1), client, None)
+                scheduler, *nannies = (psutil.Process(process.pid) for process in processes)
+                hands = [worker_of(nanny.pid) for nanny in nannies]
+                those = [[psutil.Process()], [scheduler], hands]
+                plan, began = naps(count, 0), time.perf_counter()
+                before = [sum(map(cpu_of, some)) for some in those]
+                assert all(outcome.ok for outcome in execute(plan, client, None))
+                seconds = time.perf_counter() - began
+                used = [sum(map(cpu_of, some)) - b for some, b in zip(those, before, strict=True)]
+                tasks = len(plan.tasks)
+                shown = " | ".join(f"{1e3 * cpu / tasks:.2f}" for cpu in used)
+                load = os.getloadavg()[0]
+                print(f"| {kind} | {tasks / seconds:,.0f} | {shown} | {load:.1f} |", flush=True)
+
+
+def measure_done(tiles: int, size: float) -> None:
+    """A job in this process, then the same again, of which nothing is left to do."""
+    n = round(tiles**0.5)
+    with tempfile.TemporaryDirectory() as folder:
+        write_city(Path(folder, "city"), n, size, SPACING)
+        for call in ("first", "second", "third"):
+            made = tasks = 0
+
+            def watch(outcome: Outcome, ended: int, total: int) -> None:  # noqa: ARG001
+                nonlocal made, tasks
+                made, tasks = made + outcome.made, tasks + 1
+
+            before = cpu_of(psutil.Process())
+            run_city(f"{folder}/city", f"{folder}/out", n, size, watch=watch)
+            spent = 1e3 * (cpu_of(psutil.Process()) - before) / n**2
+            print(f"{call} call: {tasks} tasks, {made} made, {spent:.1f} ms of CPU a tile")
+
+
+def measure_plan(tiles: int) -> None:
+    """Factors along every street of a city whose points are there: twelve places a tile."""
+    n, size = round(tiles**0.5), 100.0
+    with tempfile.TemporaryDirectory() as folder:
+        store = TileStore.create(f"{folder}/map.zarr", StoreSettings(size, 10.0, 0.2, None))
+        keys = [TileKey(ix, iy) for ix in range(n) for iy in range(n)]
+        points = {key: TilePoints(hash_of(key), "", 300_000) for key in keys}
+        x = np.arange(1.0, n * size, size / 2.0)
+        streets = [
+            np.stack([x, np.full_like(x, (r + 0.5) * size), x * np.nan], 1) for r in range(n)
+        ]
+        routes = [route_of(f"street {r}", street) for r, street in enumerate(streets)]
+        here, stood = psutil.Process(), peak_of(os.getpid())
+        told = {}
+
+        def note(what: str, began: float) -> float:
+            now = cpu_of(here)
+            told[what] = now - began
+            return now
+
+        now = cpu_of(here)
+        places = samples_along(store, routes, 8.0)
+        looking = Looking(ts.VLP16, 2.0, "all", 2.0)
+        plan = plan_factors(MapPlan(store, points), places, folder, looking, DEFAULT_MEMORY)
+        now = note("planned", now)
+        grown = peak_of(os.getpid()) - stood
+        store.begin(Manifest.of({key: (tile.identity, tile.count) for key, tile in points.items()}))
+        announce(plan.tasks)
+        now = note("written", now)
+        assert len(inventory_of(f"{folder}/factors")) == n**2
+        manifest = ts.open_store(store.url).manifest
+        assert manifest is not None
+        assert len(manifest.identities) == n**2
+        note("read", now)
+        seconds = ", ".join(f"{what} in {spent:.1f} s" for what, spent in told.items())
+        count, every = len(plan.tasks), sum(map(len, places.values()))
+        print(f"{n**2:,} tiles, {count:,} tasks, {every:,} places: {seconds} of CPU;")
+        print(f"{grown / 1e6:,.0f} MB for the plan, {peak_of(os.getpid()) / 1e6:,.0f} MB in all")
+
+
 def worker_of(nanny: int) -> psutil.Process:
     """The process that a nanny looks after."""
     (worker,) = (
@@ -163,6 +276,14 @@ def main(given: argparse.Namespace) -> None:
     if given.client:
         folder, n, size, address = given.client
         print(json.dumps(run_client(folder, int(n), float(size), address)))
+        return
+    if given.empty or given.done or given.plan:
+        if given.empty:
+            measure_empty(given.empty)
+        if given.done:
+            measure_done(given.done, WARM)
+        if given.plan:
+            measure_plan(given.plan)
         return
     print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}", flush=True)
     cases = [(tiles, 2) for tiles in given.tiles]

@@ -37,6 +37,7 @@ SMALLEST = (
     "raycast.py --metres 1 --rounds 1",
     "registration.py --starts 1",
     "scale.py --tiles 1 --size 20",
+    "scale.py --empty 40 --done 1 --plan 4",
     f"sendagaya.py {SHIPPED}/sendagaya_buildings.geojson.gz .",
     "shinjuku_labels.py --size small --paths III --every 40 --out labels",
     "shinjuku_labels.py --size small --paths III --every 40 --out labels --knobs drive",

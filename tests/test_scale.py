@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import city_tiles
 import distributed
@@ -11,6 +12,7 @@ import pandas as pd
 import pytest
 from city_tiles import digest, run_city, write_city, write_drive
 from elsewhere import scheduler_elsewhere
+from patience import wait_until
 
 import tilestream as ts
 from tilestream.pipeline.engine.cluster import dask_client
@@ -52,6 +54,34 @@ def test_two_workers_over_tls_write_the_bytes_of_a_serial_run(
     run_city(city, str(tmp_path), N, SIZE, client=workers)
     assert len(serial) > 35
     assert digest(tmp_path) == serial
+
+
+def test_workers_that_come_and_go_write_the_bytes_of_a_serial_run(
+    city: Path, serial: dict[str, str], tmp_path: Path
+) -> None:
+    """An adaptive cluster: none is there before there is work, and they leave when it is done."""
+    changes: list[str] = []
+
+    class Changes(distributed.SchedulerPlugin):
+        def add_worker(self, *_: Any, **__: Any) -> None:
+            changes.append("came")
+
+        def remove_worker(self, *_: Any, **__: Any) -> None:
+            changes.append("went")
+
+    with (
+        distributed.LocalCluster(
+            n_workers=0, threads_per_worker=1, processes=False, dashboard_address=None
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        cluster.scheduler.add_plugin(Changes(), name="changes")
+        cluster.adapt(minimum=0, maximum=3, interval="100ms", wait_count=2)
+        for out in ("first", "second"):
+            run_city(city, str(tmp_path / out), N, SIZE, client=client)
+            wait_until(lambda: not cluster.scheduler.workers, "the workers have left")
+    assert changes.count("came") == changes.count("went") > 1
+    assert digest(tmp_path / "first") == digest(tmp_path / "second") == serial
 
 
 @pytest.mark.slow

@@ -179,6 +179,11 @@ class Files:
         with self._reached():
             return bytes(self.fs.cat_file(self.root))
 
+    def read_end(self, count: int) -> bytes:
+        """The last bytes of this file, at most so many; raises as `read` does."""
+        with self._reached():
+            return bytes(self.fs.cat_file(self.root, start=-count))
+
     def read_all(self, names: Sequence[str]) -> list[bytes | None]:
         """The bytes of files below, in one request where that is possible; None: not there.
 

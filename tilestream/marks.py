@@ -37,6 +37,8 @@ class Mark:
         return self.status == "done" and self.identity == identity
 
 
+PLAIN = (str, int, float, bool, type(None))
+"""Types whose values are their own canonical form."""
 SEAL = "checksum"
 """The field of a JSON object that holds the checksum of the others."""
 AGAIN = "remove it (`tilestream verify --repair` does) and run the same command again"
@@ -94,6 +96,8 @@ def canonical(value: Any) -> Any:
     Raises:
         TypeError: a value of a type that has no such form.
     """
+    if type(value) in PLAIN:  # most values of a plan
+        return value
     if isinstance(value, BaseModel):
         return canonical(value.model_dump())
     if dataclasses.is_dataclass(value) and not isinstance(value, type):

@@ -169,7 +169,8 @@ def _keys_of(grid: TileGrid, rows: NDArray[np.void], route_id: str) -> Int64:
 def _samples_of(pieces: Sequence[tuple[str, NDArray[np.void]]]) -> Samples:
     """The pieces of routes that lie in one tile."""
     number = {name: index for index, name in enumerate(dict.fromkeys(name for name, _ in pieces))}
-    rows = np.concatenate([piece for _, piece in pieces])
+    rows = np.empty(sum(len(piece) for _, piece in pieces), ROW)  # else it has a type of its own
+    np.concatenate([piece for _, piece in pieces], out=rows)
     rows["route"] = np.repeat([number[n] for n, _ in pieces], [len(p) for _, p in pieces])
     return Samples(tuple(number), rows)
 

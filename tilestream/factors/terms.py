@@ -4,6 +4,8 @@ A cell's neighbours are those of the whole map (definitions, section 2), so the 
 around the tile are read too; only the tile's own are kept.
 """
 
+from functools import lru_cache
+
 import numpy as np
 
 from tilestream.factors.catalogue import CRITERIA
@@ -35,6 +37,7 @@ def reach_mm(cell_mm: int) -> int:
     return max(REACH_MM, 2 * cell_mm, SHIFT_MM + cell_mm)
 
 
+@lru_cache
 def terms_table(cell_mm: int) -> TileTable:
     """The terms of cells of one size: the columns of `TileTerms.arrays`."""
     return TileTable(

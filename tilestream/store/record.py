@@ -3,6 +3,7 @@
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -108,8 +109,7 @@ def read_record(url: str) -> Record:
     """
     root = Files.at(url).under(NODE)
     try:
-        text = root.read()
-        schema = int(said_by(text)["schema"])
+        return _record(root.read(), os.fspath(url), root.root)
     except FileNotFoundError:
         store = "FOLDER" if root.parent.there() else url
         other = f"; `tilestream info {url}` says what is there" * (store != url)
@@ -122,8 +122,17 @@ def read_record(url: str) -> Record:
             f"{url} is a file, or below one, and a tile store is a folder, which `tilestream "
             "ingest SOURCES --store FOLDER` makes: name another path"
         ) from None
+
+
+@lru_cache(maxsize=8)
+def _record(text: bytes, url: str, where: str) -> Record:
+    """What the text of a record says; a process keeps the last ones, since each task opens its map,
+    and that of a city names thousands of sources.
+    """
+    try:
+        schema = int(said_by(text)["schema"])
     except (KeyError, ValueError, TypeError) as error:
-        raise StoreError(f"{root.root} is damaged, or of no tile store: {error}") from error
+        raise StoreError(f"{where} is damaged, or of no tile store: {error}") from error
     if schema != SCHEMA:
         what = "install the newer tilestream" if schema > SCHEMA else "give another path"
         raise StoreVersionError(
@@ -131,10 +140,10 @@ def read_record(url: str) -> Record:
             f"{what}, or remove it and ingest the sources again"
         )
     try:
-        said = checked(text, root.root)
+        said = checked(text, where)
     except DamagedError as error:
         raise DamagedError(
-            f"{root.root} is damaged, without which the map cannot be read: remove the folder "
+            f"{where} is damaged, without which the map cannot be read: remove the folder "
             f"{url} and ingest its sources again"
         ) from error
     del said["schema"], said["lattice_origin"]

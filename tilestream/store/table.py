@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 from numpy.typing import NDArray
@@ -61,6 +62,7 @@ class TileTable:
         return identity_of(self.stage, self.version, takes, {"map_part": [hash_of(inputs)]})
 
 
+@lru_cache
 def cells_table(cell_mm: int) -> TileTable:
     """The cells of one size: the columns of `Cells`."""
     return TileTable(

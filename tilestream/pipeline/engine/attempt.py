@@ -3,8 +3,9 @@
 import time
 import traceback
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from tilestream.errors import NOT_RUN, TileNotReadyError, TilestreamError
@@ -119,3 +120,24 @@ def attempt(task: Task, memory: int | None = None) -> Outcome:
         return Outcome(task.key, task.stage, facts, made, seconds=time.perf_counter() - began)
     seconds = time.perf_counter() - began
     return Outcome(task.key, task.stage, {}, False, reason, seconds, details, passing)
+
+
+def attempt_all(tasks: Iterable[Task], memory: int | None = None) -> list[Outcome]:
+    """`attempt` tasks in turn, as `in_turn`."""
+    return in_turn(tasks, partial(attempt, memory=memory))
+
+
+def in_turn(tasks: Iterable[Task], outcome_of: Callable[[Task], Outcome]) -> list[Outcome]:
+    """The outcomes of tasks, each after those that it needs; of one that needs a task that failed
+    among them there is none.
+    """
+    outcomes: list[Outcome] = []
+    undone: set[str] = set()
+    for task in tasks:
+        if not undone.isdisjoint(task.needs):
+            undone.add(task.key)
+            continue
+        outcomes.append(outcome_of(task))
+        if not outcomes[-1].ok:
+            undone.add(task.key)
+    return outcomes

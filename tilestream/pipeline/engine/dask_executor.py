@@ -4,7 +4,7 @@ import logging
 import queue
 import time
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -14,20 +14,25 @@ from dask.base import annotate, get_annotations
 from distributed.comm.core import CommClosedError
 
 from tilestream.errors import TaskError
-from tilestream.pipeline.engine.attempt import Outcome, attempt
+from tilestream.pipeline.engine.attempt import Outcome, attempt_all, in_turn
 from tilestream.pipeline.engine.frontier import Frontier
 from tilestream.pipeline.engine.stage import Task
 
 logger = logging.getLogger(__name__)
 
 IN_FLIGHT_PER_THREAD = 4
-"""Tasks handed to Dask at a time, per thread of its workers."""
+"""Dask's tasks, each some of ours that travel together, that it has at a time, per thread of its
+workers."""
+PER_MESSAGE = 200
+"""Dask's tasks that are handed over in a message, at most."""
 LOOK_EVERY = 2.0
 """How often the scheduler is asked for its workers [s]."""
 ANSWER_WITHIN = 30.0
 """How long a scheduler may take to answer before it is taken for lost [s]."""
 RESULT_WITHIN = 5.0
 """How long a result of a task that has ended is waited for before a look at the scheduler [s]."""
+Tasks = tuple[Task, ...]
+"""Tasks that travel together."""
 OURS = "ts0"
 """How the part of a Dask key begins that names the run."""
 
@@ -64,25 +69,29 @@ def run_on_dask(
     workers.threads()
     workers.wait_for_orphans()
     submit = _Submitter(client, names, memory)
-    running: dict[str, tuple[Task, Any]] = {}
+    running: dict[str, tuple[Tasks, Any]] = {}
     ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
     while running or not frontier.idle:
         yield from frontier.refusals()
         window = IN_FLIGHT_PER_THREAD * max(1, workers.threads())
-        while len(running) < window and (task := frontier.take()) is not None:
-            future = submit(task, frontier.tries(task.key))
-            running[future.key] = task, future
+        share = frontier.ready // window
+        batch: list[Tasks] = []
+        while len(running) + len(batch) < window and (tasks := frontier.take_together(share)):
+            batch.append(tasks)
+        for tasks, future in submit(batch, frontier.tries):
+            running[future.key] = tasks, future
             future.add_done_callback(ended.put)
-        batch = _drain(ended) if running else []
-        results = _gathered(batch, client)
-        for future in batch:
-            outcome = results.get(future.key) or _outcome(running[future.key][0], future, workers)
-            if outcome is None:
+        over = _drain(ended) if running else []
+        results = _gathered(over, client)
+        for future in over:
+            tasks, _ = running[future.key]
+            outcomes = results.get(future.key) or _outcomes(tasks, future, workers)
+            if outcomes is None:
                 future.add_done_callback(ended.put)
             else:
                 del running[future.key]
                 future.release()
-                yield from frontier.learn(outcome)
+                yield from frontier.learn_together(tasks, outcomes)
 
 
 def _drain(ended: "queue.SimpleQueue[Any]") -> list[Any]:
@@ -95,7 +104,7 @@ def _drain(ended: "queue.SimpleQueue[Any]") -> list[Any]:
     return found
 
 
-def _gathered(futures: Sequence[Any], client: Any) -> dict[str, Outcome]:
+def _gathered(futures: Sequence[Any], client: Any) -> dict[str, list[Outcome]]:
     """The outcomes by Dask key of those futures that give one at once, in one request."""
     whole = [future for future in futures if future.status == "finished"]
     gather = partial(client.gather, whole, asynchronous=True)
@@ -115,33 +124,57 @@ class _Submitter:
         self._memory = memory
         self._spans: dict[str, Any] = {}
 
-    def __call__(self, task: Task, tries: int) -> Any:
-        """The future of a task that has failed `tries` times."""
-        if task.stage not in self._spans:
-            with distributed.span("tilestream", task.stage):
-                self._spans[task.stage] = get_annotations()["span"]
-        key = self._names(task.key) + (f"#{tries + 1}" if tries else "")
-        with annotate(span=self._spans[task.stage]):
-            return self._client.submit(attempt, task, self._memory, key=key, pure=False)
+    def __call__(
+        self, batch: Iterable[Tasks], tries: Callable[[str], int]
+    ) -> Iterator[tuple[Tasks, Any]]:
+        """Tasks that travel together, each with the future of its outcomes, which has the name of
+        the first of them.
+
+        One message for many: it costs a scheduler as much as one for a single task.
+
+        Args:
+            batch: tasks that travel together, of whichever stages.
+            tries: how often the task of a key has failed.
+        """
+        of_stage: dict[str, list[Tasks]] = {}
+        for tasks in batch:
+            of_stage.setdefault(tasks[0].stage, []).append(tasks)
+        for stage, some in of_stage.items():
+            keys = [self._key(tasks[0].key, tries(tasks[0].key)) for tasks in some]
+            how = {"memory": self._memory, "pure": False, "batch_size": PER_MESSAGE}
+            with annotate(span=self._span(stage)):
+                futures = self._client.map(attempt_all, some, key=keys, **how)
+            yield from zip(some, futures, strict=True)
+
+    def _key(self, key: str, tries: int) -> str:
+        return self._names(key) + (f"#{tries + 1}" if tries else "")
+
+    def _span(self, stage: str) -> Any:
+        if stage not in self._spans:
+            with distributed.span("tilestream", stage):
+                self._spans[stage] = get_annotations()["span"]
+        return self._spans[stage]
 
 
-def _outcome(task: Task, future: Any, workers: "_Workers") -> Outcome | None:
-    """What became of a task on Dask; None where its result was lost and it runs once more.
+def _outcomes(tasks: Tasks, future: Any, workers: "_Workers") -> list[Outcome] | None:
+    """What became of tasks on Dask; None where their result was lost and they run once more.
 
     A worker that was lost too often is a failure too, and may be passing: it may have died of
-    another task. A result that was lost with its worker is waited for: Dask does the task again,
-    which finds its work marked as done.
+    another task. A result that was lost with its worker is waited for: Dask does the tasks again,
+    which finds their work marked as done.
     """
     try:
-        outcome: Outcome = future.result(timeout=RESULT_WITHIN)
+        outcomes: list[Outcome] = future.result(timeout=RESULT_WITHIN)
     except TimeoutError:
         workers.require_scheduler()
         return None
     except Exception as error:  # noqa: BLE001 - `attempt` never raises, so this is Dask's own
         workers.require_scheduler()
         reason = f"lost by Dask: {error or future.status}"
-        return Outcome(task.key, task.stage, reason=reason, passing=True)
-    return outcome
+        return in_turn(
+            tasks, lambda task: Outcome(task.key, task.stage, reason=reason, passing=True)
+        )
+    return outcomes
 
 
 class _Workers:

@@ -61,7 +61,8 @@ def execute(
         The outcomes in the order of the tasks, whatever the order in which they ended.
 
     Raises:
-        UsageError: an asynchronous client, or a worker that does not see what is shared.
+        UsageError: an asynchronous client, a worker that does not see what is shared, or that may
+            use less memory than a task.
         TaskError: the scheduler was lost, or has had no worker for too long. What is done is
             marked: the same command continues.
     """
@@ -77,7 +78,7 @@ def execute(
         client = client.for_tasks(run.frontier.left if grow is None else client.most)
     names = DaskNames()
     require_blocking(client)
-    meet = partial(require_seen, client, shared, inputs)
+    meet = partial(require_seen, client, shared, inputs, memory=plan.memory)
     with dashboard_client(client, names, shared) as page:
         run.show(page)
         run.hear(run_on_dask(run.frontier, client, names, plan.memory, patience, meet))

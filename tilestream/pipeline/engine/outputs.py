@@ -8,10 +8,12 @@ from typing import Any, NamedTuple, Protocol
 
 import pandas as pd
 
+from tilestream.files import Files
 from tilestream.grid import TileKey
 from tilestream.marks import Mark
 from tilestream.records import Column
 from tilestream.store import Tile, open_store
+from tilestream.store.arrays import read_marks
 from tilestream.tables import read_mark, read_tables, write_table
 
 Facts = Mapping[str, Any]
@@ -54,7 +56,7 @@ class Output(Protocol):
         """What was written."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class TileArrays:
     """A table of a tile of a store: an array per column."""
 
@@ -63,8 +65,8 @@ class TileArrays:
     table: str
 
     def known(self, identity: str) -> Facts | None:
-        """As `Output`."""
-        mark = self._there().mark(self.table)
+        """As `Output`; the store's own record, long where a map has many sources, is not read."""
+        (mark,) = read_marks(Files.at(self.store_url), [f"{self.tile}/{self.table}"])
         return mark.facts if mark.is_of(identity) else None
 
     def write(self, made: Made, identity: str, columns: Sequence[Column]) -> Facts:  # noqa: ARG002

@@ -1,4 +1,4 @@
-"""Whether a client can be used: it answers at once, and its workers see what they are to write."""
+"""Whether a client can be used: it answers at once, its workers see what they write and hold it."""
 
 import uuid
 from collections.abc import Mapping, Sequence
@@ -7,6 +7,7 @@ from typing import Any
 
 from tilestream.errors import UsageError
 from tilestream.files import Files, without_secrets
+from tilestream.pipeline.engine.plan import megabytes
 
 ANSWER_WITHIN = 120.0
 """How long workers may take to look before the run goes on without their answer [s]: a new one
@@ -32,8 +33,9 @@ def require_seen(
     places: Sequence[str],
     inputs: Sequence[str] = (),
     workers: Sequence[str] | None = None,
+    memory: int = 0,
 ) -> None:
-    """Refuse workers that do not see the places in which they are to work.
+    """Refuse workers that do not see the places in which they are to work, or are too small.
 
     A small file is written to each and read by every worker; of a place where none can be written,
     and of an input, it is looked whether it is there.
@@ -44,16 +46,19 @@ def require_seen(
         inputs: files and stores that are there, and only read; of those of one kind in one folder
             one is looked at.
         workers: addresses of those that are asked; None: all that are there now.
+        memory: what a task may use [bytes]: a worker that is ended before would take one task
+            after the other with it.
 
     Raises:
-        UsageError: some do not find it, or have no tilestream; says which, what, and what to do.
+        UsageError: some do not find it, may use less memory, or have no tilestream; says which,
+            what, and what to do.
     """
     probe = f".seen-{uuid.uuid4().hex}"
     files = [Files.at(place).under(probe) for place in dict.fromkeys(places)]
     try:
         told = {file.parent.address: _written(file, probe) for file in files}
         told |= {place: "" for place in _some_of(inputs) if place not in told}
-        answers = _answers(client, told, workers)
+        answers = _answers(client, told, workers, memory)
     finally:
         for file in files:
             with suppress(OSError):
@@ -79,6 +84,8 @@ def _told(answer: tuple[str, str] | Exception) -> str:
     if isinstance(answer, Exception):
         return f"cannot work ({answer}): all workers need tilestream, of the client's version"
     place, why = answer
+    if not place:
+        return why
     shown = without_secrets(place)
     do = (
         "start them with the credentials and settings of this store that the client has"
@@ -101,20 +108,28 @@ def _written(file: Files, probe: str) -> str:
 
 
 def _answers(
-    client: Any, probes: Mapping[str, str], workers: Sequence[str] | None
+    client: Any, probes: Mapping[str, str], workers: Sequence[str] | None, memory: int
 ) -> dict[str, Any]:
     """What `_look` says, by worker; of one that cannot run it the exception; nothing where the
     workers are busy, or the scheduler is lost, which the run finds out itself.
     """
     how = {"on_error": "return", "callback_timeout": ANSWER_WITHIN}
     try:
-        return dict(client.run(_look, probes, workers=workers, **how))
+        return dict(client.run(_look, probes, memory, workers=workers, **how))
     except (TimeoutError, OSError):
         return {}
 
 
-def _look(probes: Mapping[str, str]) -> tuple[str, str] | None:
-    """The first place that a worker does not see, and why; None: it sees them all."""
+def _look(probes: Mapping[str, str], memory: int, dask_worker: Any) -> tuple[str, str] | None:
+    """The first place that a worker does not see, and why, or why it is too small, and no place;
+    None: it can do all.
+    """
+    limit = dask_worker.memory_manager.memory_limit
+    if limit and limit < memory:
+        return "", (
+            f"may use {megabytes(limit)}, and a task {megabytes(memory)}: start it with more "
+            "(--memory-limit), or allow tasks less (--memory)"
+        )
     for place, probe in probes.items():
         try:
             where = Files.at(place)

@@ -130,7 +130,7 @@ class Task:
         """Name of the stage."""
         return self.applies.name
 
-    @property
+    @cached_property
     def key(self) -> str:
         """Unique name, `stage-…`, as the dashboard shows it."""
         return f"{self.stage}-{self.name}"

@@ -187,7 +187,7 @@ def _sources_of(task: Task) -> tuple[str, ...]:
     """The log and the map that a task reads."""
     scans, part = (task.reads.get(name) for name in ("scans", "map_part"))
     found = [scans.reading.path] if isinstance(scans, DriveScans) else []
-    return (*found, *([part.store.address] if isinstance(part, MapPart) else ()))
+    return (*found, *([place_of(part.store_url)] if isinstance(part, MapPart) else ()))
 
 
 def _stamps_of(task: Task) -> tuple[int, ...]:

@@ -7,7 +7,7 @@ from tilestream.pipeline.engine.stage import Counts
 from tilestream.store import POINTS, TileStore, open_store
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class MapPart:
     """Some tiles of a map, as a task reads them: through the store, by place."""
 

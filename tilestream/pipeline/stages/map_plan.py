@@ -1,7 +1,8 @@
 """The map as a plan sees it: the tables of its tiles, those that are there and those to be made."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -61,6 +62,7 @@ class MapPlan:
         self.points = points
         self.tasks: dict[str, Task] = {}
         """By key, each after those that it needs."""
+        self._own = {key: key for key in points}  # a plan of a city has each key a hundred times
         self._state = hash_of([(str(key), tile.identity) for key, tile in sorted(points.items())])
 
     @classmethod
@@ -109,21 +111,20 @@ class MapPlan:
 
     def cells(self, key: TileKey, cell_mm: int) -> Task:
         """The task that makes the cells of a tile."""
-        return self._made(cells, cells_table(cell_mm), f"{cell_mm}-{key}", key, [])
+        return self._made(cells, cells_table(cell_mm), f"{cell_mm}-{key}", key)
 
     def terms(self, key: TileKey, cell_mm: int) -> Task:
         """The task that makes the terms of a tile's cells."""
-        table = terms_table(cell_mm)
-        near = [self.cells(k, cell_mm) for k in table.tiles(self.store.grid, key, self.points)]
-        return self._made(terms, table, f"{cell_mm}-{key}", key, near)
+        name, near = f"{cell_mm}-{key}", partial(self.cells, cell_mm=cell_mm)
+        return self._made(terms, terms_table(cell_mm), name, key, near)
 
     def surfels(self, key: TileKey) -> Task:
         """The task that makes the surfels of a tile."""
-        return self._made(surfels, surfels_table(surfel_mm(self.store)), str(key), key, [])
+        return self._made(surfels, surfels_table(surfel_mm(self.store)), str(key), key)
 
     def above(self, key: TileKey) -> Task:
         """The task that makes the picture of a tile from above."""
-        return self._made(above, above_table(), str(key), key, [])
+        return self._made(above, above_table(), str(key), key)
 
     def part(self, keys: Sequence[TileKey], made: Sequence[Task]) -> MapPart:
         """Some tiles as a task reads them.
@@ -136,7 +137,8 @@ class MapPlan:
         inputs = [(str(task.tile), task.identity) for task in made]
         inputs = inputs or [(str(k), p.identity) for k, p in zip(keys, points, strict=True)]
         makers = [task.key for task in made] or [p.maker for p in points if p.maker]
-        return MapPart(self.store.url, tuple(keys), hash_of(inputs), tuple(makers), self._state)
+        own = tuple(self._own[key] for key in keys)
+        return MapPart(self.store.url, own, hash_of(inputs), tuple(makers), self._state)
 
     def count(self, keys: Iterable[TileKey]) -> int:
         """The points of some tiles, as they are or are expected."""
@@ -147,18 +149,33 @@ class MapPlan:
         return max((self.points[key].count for key in keys), default=0)
 
     def _made(
-        self, stage: Stage, table: TileTable, name: str, key: TileKey, near: Sequence[Task]
+        self,
+        stage: Stage,
+        table: TileTable,
+        name: str,
+        key: TileKey,
+        near: Callable[[TileKey], Task] | None = None,
     ) -> Task:
+        """The task that makes a table of a tile, once.
+
+        Args:
+            stage: what makes it.
+            table: which one.
+            name: of the task.
+            key: the tile.
+            near: the task that makes what is read of a tile in reach; None: its points are read.
+        """
         known = self.tasks.get(f"{stage.name}-{name}")
         if known is not None:
             return known
         keys = table.tiles(self.store.grid, key, self.points)
+        part = self.part(keys, [] if near is None else [near(k) for k in keys])
         task = Task(
             stage,
             name,
             TileArrays(self.store.url, key, table.name),
             takes={**table.takes, "tile": key},
-            reads={"map_part": replace(self.part(keys, near), core=key)},
+            reads={"map_part": replace(part, core=key)},
             counts={"points": self.count(keys), "core": self.points[key].count},
             tile=key,
         )
