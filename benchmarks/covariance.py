@@ -77,7 +77,10 @@ def held_out(dataset: Dataset, prediction_error: float) -> pd.DataFrame:
     for split in leave_path_out(dataset):
         train = dataset.take(split.train)
         known = calibration_of(train)
-        assert known is not None, "runs of an older version"
+        if known is None:
+            raise SystemExit(
+                "labels without moments, of an older version: run the retraining again"
+            )
         core = cores_of(dataset, prediction_error, known.width)
         rows = dataset.rows.iloc[split.train]
         one = {

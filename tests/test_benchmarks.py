@@ -49,6 +49,7 @@ SMALLEST = (
     "walk.py",
 )
 OF_A_FINISHED_RUN = (
+    "covariance.py retrained",
     "drive_estimate.py drive",
     "experiment.py city",
     "filter.py city drive --train city --seeds 2 --train-seeds 1",
