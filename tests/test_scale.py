@@ -57,7 +57,7 @@ def test_two_workers_over_tls_write_the_bytes_of_a_serial_run(
 
 
 def test_workers_that_come_and_go_write_the_bytes_of_a_serial_run(
-    city: Path, serial: dict[str, str], tmp_path: Path
+    city: Path, serial: dict[str, str], tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     """An adaptive cluster: none is there before there is work, and they leave when it is done."""
     changes: list[str] = []
@@ -77,23 +77,25 @@ def test_workers_that_come_and_go_write_the_bytes_of_a_serial_run(
     ):
         cluster.scheduler.add_plugin(Changes(), name="changes")
         cluster.adapt(minimum=0, maximum=3, interval="100ms", wait_count=2)
-        for out in ("first", "second"):
-            run_city(city, str(tmp_path / out), N, SIZE, client=client)
+        for _ in range(2):
+            out = tmp_path_factory.mktemp("adaptive")
+            run_city(city, str(out), N, SIZE, client=client)
+            assert digest(out) == serial
             wait_until(lambda: not cluster.scheduler.workers, "the workers have left")
     assert changes.count("came") == changes.count("went") > 1
-    assert digest(tmp_path / "first") == digest(tmp_path / "second") == serial
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
 def test_any_number_of_workers_writes_the_bytes_of_a_serial_run(
-    city: Path, serial: dict[str, str], tmp_path: Path, workers: int
+    city: Path, serial: dict[str, str], tmp_path_factory: pytest.TempPathFactory, workers: int
 ) -> None:
+    tcp, local = (tmp_path_factory.mktemp(name) for name in ("tcp", "local"))
     with scheduler_elsewhere(workers) as (address, _), dask_client(address, None, 1) as client:
-        run_city(city, str(tmp_path / "tcp"), N, SIZE, client=client)
+        run_city(city, str(tcp), N, SIZE, client=client)
     with dask_client(None, workers, 10**9) as client:
-        run_city(city, str(tmp_path / "local"), N, SIZE, client=client)
-    assert digest(tmp_path / "tcp") == digest(tmp_path / "local") == serial
+        run_city(city, str(local), N, SIZE, client=client)
+    assert digest(tcp) == digest(local) == serial
 
 
 @pytest.mark.slow

@@ -53,7 +53,7 @@ def require_seen(
         UsageError: some do not find it, may use less memory, or have no tilestream; says which,
             what, and what to do.
     """
-    probe = f".seen-{uuid.uuid4().hex}"
+    probe = f".seen.{uuid.uuid4().hex}.part"  # which the next run clears up after a killed one
     files = [Files.at(place).under(probe) for place in dict.fromkeys(places)]
     try:
         told = {file.parent.address: _written(file, probe) for file in files}
