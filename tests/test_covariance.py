@@ -259,3 +259,22 @@ def test_untrained_it_is_the_moments_of_the_virtual_drive() -> None:
     core = cores(street(3, 5), 0.3, 1.5)
     found = calibrated(core, as_it_is(1.5))
     np.testing.assert_allclose(matrices(found), matrices(core), atol=1e-15)
+
+
+def test_places_where_one_start_holds_or_none_are_learnt_from_as_far_as_they_say_something() -> (
+    None
+):
+    table, labels = labelled(30, np.ones((2, 6)))
+    one = draw(np.random.default_rng(1), lost=1.1)
+    axes, error = one.axes.copy(), one.error.copy()
+    axes[0, 0], error[0] = 0.01, 0.01
+    alone = pd.DataFrame([row(replace(one, axes=axes, error=error), sample=90, arc=500.0)])
+    none = pd.DataFrame([row(one, sample=91, arc=600.0)])
+    core = cores(pd.concat([table, alone, none], ignore_index=True), 0.3, 0.0)
+    assert core["nvtl_sd"].tolist()[-2:] == [0.0, pytest.approx(np.nan, nan_ok=True)]
+    more = pd.concat([labels, labels.iloc[:2]], ignore_index=True)
+    found = calibrate_covariance(core, more, 0.0)
+    assert found.places == 31
+    assert as_json(from_json(as_json(found))) == as_json(found)
+    nothing = calibrate_covariance(core.iloc[-1:], more.iloc[-1:], 0.0)
+    assert as_json(nothing) == as_json(as_it_is(0.0))

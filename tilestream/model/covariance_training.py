@@ -10,6 +10,7 @@ from tilestream.model.covariance import (
     Calibration,
     about,
     about_bias,
+    as_it_is,
     calibrated,
     cores,
     matrices,
@@ -38,8 +39,13 @@ def calibrate_covariance(core: pd.DataFrame, labels: pd.DataFrame, width: float)
         core: of the places (`cores`, averaged over `width`).
         labels: their label rows: `near_p_fail`, `near_along_along`, …; `near_nvtl`, …
         width: of the kernel [m].
+
+    Returns:
+        The calibration; that of a virtual drive without training where no place has both.
     """
     good = (core["cov_along_along"].notna() & labels["near_along_along"].notna()).to_numpy()
+    if not good.any():
+        return as_it_is(width)
     core, labels = core[good], labels[good]
     mean, real = core[list(BIAS)].to_numpy(), labels[list(NEAR_MEANS)].to_numpy()
     power = (mean**2).sum(axis=0)
@@ -53,8 +59,10 @@ def calibrate_covariance(core: pd.DataFrame, labels: pd.DataFrame, width: float)
     for name in SCORES:
         score, spread = (labels[f"near_{name}{end}"].to_numpy() for end in ("", "_sd"))
         times = float(np.median(score / core[name]))
-        off = ((score - times * core[name]) ** 2 + spread**2) / core[f"{name}_sd"] ** 2
-        scores[name] = (times, float(np.sqrt(off.mean())))
+        expected, sd = times * core[name].to_numpy(), core[f"{name}_sd"].to_numpy()
+        known = sd > 0.0  # one start that holds has no spread
+        off = ((score - expected) ** 2 + spread**2)[known] / sd[known] ** 2
+        scores[name] = (times, float(np.sqrt(off.mean())) if known.any() else 1.0)
     return Calibration(gain, scale, added, lost, scores, width, len(core))
 
 

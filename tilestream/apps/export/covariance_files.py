@@ -37,7 +37,8 @@ MEANT = (
     "(standard deviation in map x and in y), and that ends within 0.5 m of the truth; p_lost is "
     "the share of those that end farther away. They are of the pose of the lidar (of several: of "
     "the frame of their mounts), about the truth: a bias counts. A filter that takes the expected "
-    "error e (bias) from its registrations has this covariance - e e^T."
+    "error e (bias) from its registrations has this covariance - e e^T; that helped in simulation, "
+    "and not on real drives."
 )
 """What the covariances are of."""
 
