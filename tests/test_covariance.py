@@ -269,12 +269,16 @@ def test_places_where_one_start_holds_or_none_are_learnt_from_as_far_as_they_say
     axes, error = one.axes.copy(), one.error.copy()
     axes[0, 0], error[0] = 0.01, 0.01
     alone = pd.DataFrame([row(replace(one, axes=axes, error=error), sample=90, arc=500.0)])
-    none = pd.DataFrame([row(one, sample=91, arc=600.0)])
-    core = cores(pd.concat([table, alone, none], ignore_index=True), 0.3, 0.0)
-    assert core["nvtl_sd"].tolist()[-2:] == [0.0, pytest.approx(np.nan, nan_ok=True)]
-    more = pd.concat([labels, labels.iloc[:2]], ignore_index=True)
+    axes, error = one.axes.copy(), one.error.copy()
+    axes[-1, 0], error[-1] = 0.01, 0.01
+    far = pd.DataFrame([row(replace(one, axes=axes, error=error), sample=91, arc=550.0)])
+    none = pd.DataFrame([row(one, sample=92, arc=600.0)])
+    core = cores(pd.concat([table, alone, far, none], ignore_index=True), 0.3, 0.0)
+    np.testing.assert_array_equal(core["nvtl_sd"].tolist()[-3:], [0.0, np.nan, np.nan])
+    assert core["cov_along_along"].notna().tolist()[-3:] == [True, True, False]
+    more = pd.concat([labels, labels.iloc[:3]], ignore_index=True)
     found = calibrate_covariance(core, more, 0.0)
-    assert found.places == 31
+    assert found.places == 32
     assert as_json(from_json(as_json(found))) == as_json(found)
     nothing = calibrate_covariance(core.iloc[-1:], more.iloc[-1:], 0.0)
     assert as_json(nothing) == as_json(as_it_is(0.0))

@@ -55,15 +55,22 @@ def calibrate_covariance(core: pd.DataFrame, labels: pd.DataFrame, width: float)
     fits = [_fitted(virtual[:, i, i], measured[:, i, i]) for i in range(len(AXES))]
     scale, added = np.array(fits).T
     lost = float((labels["near_p_fail"].to_numpy() - core["p_lost"].to_numpy()).mean())
-    scores = {}
-    for name in SCORES:
-        score, spread = (labels[f"near_{name}{end}"].to_numpy() for end in ("", "_sd"))
-        times = float(np.median(score / core[name]))
-        expected, sd = times * core[name].to_numpy(), core[f"{name}_sd"].to_numpy()
-        known = sd > 0.0  # one start that holds has no spread
-        off = ((score - expected) ** 2 + spread**2)[known] / sd[known] ** 2
-        scores[name] = (times, float(np.sqrt(off.mean())) if known.any() else 1.0)
+    scores = {name: _scores(core, labels, name) for name in SCORES}
     return Calibration(gain, scale, added, lost, scores, width, len(core))
+
+
+def _scores(core: pd.DataFrame, labels: pd.DataFrame, name: str) -> tuple[float, float]:
+    """How many times larger a real score is, and its standard deviation; of places whose near ring
+    holds by more than one start, without which there is no spread.
+    """
+    known = (core[f"{name}_sd"] > 0.0).to_numpy()
+    if not known.any():
+        return 1.0, 1.0
+    virtual, sd = (core.loc[known, f"{name}{end}"].to_numpy() for end in ("", "_sd"))
+    score, spread = (labels.loc[known, f"near_{name}{end}"].to_numpy() for end in ("", "_sd"))
+    times = float(np.median(score / virtual))
+    off = ((score - times * virtual) ** 2 + spread**2) / sd**2
+    return times, float(np.sqrt(off.mean()))
 
 
 def cores_of(dataset: Dataset, prediction_error: float, width: float) -> pd.DataFrame:
