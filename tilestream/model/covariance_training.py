@@ -60,17 +60,17 @@ def calibrate_covariance(core: pd.DataFrame, labels: pd.DataFrame, width: float)
 
 
 def _scores(core: pd.DataFrame, labels: pd.DataFrame, name: str) -> tuple[float, float]:
-    """How many times larger a real score is, and its standard deviation; of places whose near ring
-    holds by more than one start, without which there is no spread.
+    """How many times larger a real score is, and its standard deviation: of places whose near ring
+    holds by one start at least, all their squares together, since that of one start has no spread.
     """
-    known = (core[f"{name}_sd"] > 0.0).to_numpy()
-    if not known.any():
-        return 1.0, 1.0
+    known = core[name].notna().to_numpy()
     virtual, sd = (core.loc[known, f"{name}{end}"].to_numpy() for end in ("", "_sd"))
     score, spread = (labels.loc[known, f"near_{name}{end}"].to_numpy() for end in ("", "_sd"))
+    if not sd.any():
+        return 1.0, 1.0
     times = float(np.median(score / virtual))
-    off = ((score - times * virtual) ** 2 + spread**2) / sd**2
-    return times, float(np.sqrt(off.mean()))
+    off = (score - times * virtual) ** 2 + spread**2
+    return times, float(np.sqrt(off.sum() / (sd**2).sum()))
 
 
 def cores_of(dataset: Dataset, prediction_error: float, width: float) -> pd.DataFrame:
