@@ -1,12 +1,15 @@
 """Covariances of places against the registrations that they are of, on streets left out.
 
-    python benchmarks/covariance.py RETRAINED [--json FILE] [--prediction-error M]
+    python benchmarks/covariance.py RETRAINED [--drives RUN ...] [--json FILE]
 
 Over the runs of pipelines/retrain.py. Each street is left out in all seeds, presets and lidars, the
 rest calibrates; then every start within 1 m of the truth that holds is normalised by the covariance
 of its place. Per axis the error squared / variance (1 is right), and how many of the starts lie in
 the ellipses (x, y) that a Gaussian would fill to 50, 90 and 99 %: of ours, and of one constant that
 is fitted on the same streets. Brackets are 90 % intervals by resampled blocks of 200 m.
+
+With --drives, instead, all runs calibrate and other runs are judged, drive by drive: those that
+benchmarks/drives.py made of real drives, which train nothing.
 """
 
 import argparse
@@ -19,6 +22,7 @@ def options() -> argparse.Namespace:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("retrained", type=Path, help="the folder of the retraining")
+    parser.add_argument("--drives", type=Path, nargs="+", default=[], help="judge these runs")
     parser.add_argument("--json", type=Path, help="write all figures into this file too")
     parser.add_argument(
         "--prediction-error", type=float, default=0.3, help="of the filter in x and in y [m]"
@@ -41,6 +45,7 @@ from tilestream.model.bootstrap import resampled, span
 from tilestream.model.covariance import (
     BIAS,
     ELEMENTS,
+    Calibration,
     about_bias,
     calibrated,
     matrices,
@@ -48,8 +53,9 @@ from tilestream.model.covariance import (
 from tilestream.model.covariance_training import calibration_of, cores_of
 from tilestream.model.dataset import Dataset
 from tilestream.model.splits import leave_path_out
-from tilestream.moments import AXES, PAIRS
+from tilestream.moments import AXES, PAIRS, SCORES
 from tilestream.pipeline.jobs.train_over import dataset_over
+from tilestream.pipeline.stages.samples import DatasetFile
 from tilestream.records import Float64
 from tilestream.tables import read_tables
 
@@ -169,6 +175,45 @@ def figures(
     return told
 
 
+def judged(folder: Path, known: Calibration, prediction_error: float) -> list[dict[str, Any]]:
+    """A row per drive of another run: error squared / variance per axis, measured / expected scores
+    and how many are normal, expected and measured lost share, and how the signed mean errors of
+    virtual and real near starts correlate.
+    """
+    dataset = DatasetFile(f"{folder}/tables/samples/dataset.parquet").read()
+    core = cores_of(dataset, prediction_error, known.width)
+    places, told = calibrated(core, known), []
+    for group, rows in dataset.rows.groupby("group"):
+        here, virtual = places.loc[rows.index], core.loc[rows.index]
+        row: dict[str, Any] = {"drive": f"{folder.name}, {group}", "places": len(rows)}
+        for axis in AXES:
+            row[axis] = float((rows[f"near_{axis}_{axis}"] / here[f"cov_{axis}_{axis}"]).mean())
+        for name in SCORES:
+            real = rows[f"near_{name}"]
+            row[name] = float((real / here[name]).median())
+            normal = real.between(here[f"{name}_low"], here[f"{name}_high"])
+            row[f"{name} normal"] = float(normal.mean())
+        row["lost, expected"], row["lost"] = here["p_lost"].mean(), rows["near_p_fail"].mean()
+        for axis in AXES[:3]:
+            row[f"sides {axis}"] = float(virtual[f"bias_{axis}"].corr(rows[f"near_{axis}"]))
+        told.append(row)
+    return told
+
+
+def of_drives(dataset: Dataset) -> None:
+    """Judge other runs by the calibration of all of a dataset, and print."""
+    known = calibration_of(dataset)
+    if known is None:
+        raise SystemExit("labels without moments, of an older version: run the retraining again")
+    rows = [row for f in GIVEN.drives for row in judged(f, known, GIVEN.prediction_error)]
+    table = pd.DataFrame(rows).set_index("drive").T
+    print("| | " + " | ".join(map(str, table)) + " |\n" + "|---" * (len(table.columns) + 1) + "|")
+    for name, values in table.iterrows():
+        print(f"| {name} | " + " | ".join(f"{value:.3g}" for value in values) + " |")
+    if GIVEN.json is not None:
+        GIVEN.json.write_text(json.dumps(rows, indent=1) + "\n")
+
+
 def main() -> None:
     """Judge and print."""
     runs = {run.name: run for run in sorted((GIVEN.retrained / "runs").iterdir())}
@@ -176,6 +221,9 @@ def main() -> None:
     for name in sorted(set(runs) - set(done)):
         print(f"{name} is not done: left out")
     dataset = dataset_over(done)
+    if GIVEN.drives:
+        of_drives(dataset)
+        return
     places = held_out(dataset, GIVEN.prediction_error)
     found = normalised(dataset, places, starts_of(GIVEN.retrained, dataset))
     kinds = {"all": np.ones(len(dataset), np.bool_)}
