@@ -121,6 +121,10 @@ async def _send(socket: WebSocketClientConnection, message: str) -> None:
     await socket.write_message(message)
 
 
+async def _close(socket: WebSocketClientConnection) -> None:
+    socket.close()
+
+
 async def _next(socket: WebSocketClientConnection) -> str | bytes | None:
     return await socket.read_message()
 
@@ -139,7 +143,7 @@ def chromium_page() -> Iterator[Page]:
             port = _port(browser, Path(profile) / "DevToolsActivePort")
             socket = loop.run_until_complete(_connect(port))
             yield Page(loop, socket)
-            socket.close()
+            loop.run_until_complete(_close(socket))
         finally:
             browser.terminate()
             browser.wait(PATIENCE)

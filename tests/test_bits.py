@@ -243,6 +243,7 @@ MAY = {
     "model/corrected.py": "over the leaves of one tree",
     "model/correlation.py": "over the pieces of all routes, which no task shares out",
     "model/covariance.py": "6 x 6 of one place",
+    "model/covariance_training.py": "3 x 3 of one place",
     "model/domain.py": "over all training places, in one thread",
     "model/explain.py": "over all training places, in one thread",
     "model/figures.py": "over the blocks of all labelled places",
