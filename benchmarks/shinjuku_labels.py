@@ -207,7 +207,7 @@ def knobs_of_the_drive(settings: SimulationSettings, given: argparse.Namespace) 
         other = replace(city, settings=changed(settings, changes))
         error = []
         for (street, point), cells in zip(places, maps, strict=True):
-            scan = next(iter(scans(other, street, (point, point + 1))))
+            scan = next(iter(scans(other, street, range(point, point + 1))))
             assert scan.T_map_lidar is not None
             label = ts.localization_error(cells, scan.points, scan.T_map_lidar, settings=matcher)
             error.append(label.error_mean)

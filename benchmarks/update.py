@@ -110,7 +110,7 @@ def main(edge: int, replaced: list[int], size: float, spacing: float) -> None:
             (folder / f"{route.route_id.replace(' ', '_')}.csv").write_text(
                 "x,y\n" + "".join(lines)
             )
-        run(job(folder, folder / "warm", size, spacing * 4))
+        run(job(folder, folder / "warm", size, spacing * 3))
         print(f"| files replaced | tiles | {' | '.join(STAGES)} | CPU s | of the whole |")
         print("|---" * (len(STAGES) + 4) + "|")
         whole, made = run(job(folder, folder / "run", size, spacing))
