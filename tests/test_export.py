@@ -94,7 +94,9 @@ def exported(run: Path, out: Path, **how: Any) -> Any:
     """What is in a file."""
     told = ts.export("covariance", run, out, **how)
     assert told["file"] == str(out)
-    return told, pd.read_csv(out) if how.get("format", "csv") == "csv" else out.read_text()
+    return told, pd.read_csv(out, float_precision="round_trip") if how.get(
+        "format", "csv"
+    ) == "csv" else out.read_text()
 
 
 # --- In Python
