@@ -94,9 +94,14 @@ def exported(run: Path, out: Path, **how: Any) -> Any:
     """What is in a file."""
     told = ts.export("covariance", run, out, **how)
     assert told["file"] == str(out)
-    return told, pd.read_csv(out, float_precision="round_trip") if how.get(
-        "format", "csv"
-    ) == "csv" else out.read_text()
+    return told, table_in(out) if how.get("format", "csv") == "csv" else out.read_text()
+
+
+def table_in(file: Path) -> pd.DataFrame:
+    """A CSV, its numbers to the bit, which not every pandas reads them to."""
+    texts = pd.read_csv(file, dtype=str, keep_default_na=False)
+    numbers = [name for name in texts if name != "route"]
+    return texts.assign(**{str(n): texts[n].map(lambda x: float(x or "nan")) for n in numbers})
 
 
 # --- In Python
