@@ -5,6 +5,7 @@ for.
 import itertools
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from tilestream.errors import SourceNotFoundError, UsageError
 from tilestream.factors import observability
 from tilestream.factors.rows import PLACE_COLUMNS, STATUS_COLUMNS
 from tilestream.model.correlation import POOLED
-from tilestream.model.covariance import COVARIANCE_COLUMNS
+from tilestream.model.covariance import COVARIANCE_COLUMNS, as_it_is, calibration_told
 from tilestream.model.training import PREDICTION_COLUMNS
 from tilestream.moments import AXES, PAIRS
 
@@ -395,3 +396,17 @@ def test_the_command_says_and_writes_the_same(
     made.unlink()
     assert command(["export", "covariance", str(run), "--lost", "2"]) == 2
     assert "lost" in capsys.readouterr().err
+
+
+def test_what_covariances_rest_on_is_told_in_every_file_that_has_words(tmp_path: Path) -> None:
+    run = write_covariances(tmp_path / "run")
+    report = run / "report" / "report.json"
+    report.parent.mkdir()
+    for words in (calibration_told(None), calibration_told(replace(as_it_is(1.5), places=1234))):
+        report.write_text(json.dumps({"facts": {"model": {"covariances": words}}}))
+        told, text = exported(run, tmp_path / "a.json", format="json")
+        assert told["rest_on"] == words
+        assert f"They are {words}." in json.loads(text)["about"]
+    assert "1,234" in words
+    report.unlink()
+    assert "does not say" in exported(run, tmp_path / "a.csv")[0]["rest_on"]

@@ -7,9 +7,9 @@ how many do not is told apart from it.
 import itertools
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from tilestream.records import Column, Criterion, FactorSet, Float64, Registrations
+from tilestream.records import Column, Criterion, FactorSet, Float64, Int64
 
 AXES = ("along", "across", "up", "roll", "pitch", "yaw_vector")
 """The six signed errors of a start (`start_errors`)."""
@@ -107,13 +107,22 @@ def scores_of(prefix: str, nvtl: Float64, tp: Float64, held: NDArray[np.bool_]) 
     return found
 
 
-def autoware_scores(found: Registrations) -> tuple[Float64, Float64]:
+def autoware_scores(
+    nvtl: Float64, score: Float64, hits: Int64, points: ArrayLike
+) -> tuple[Float64, Float64]:
     """(k,) NVTL and transform probability as Autoware publishes them.
 
     Its NVTL is over the points that have a cell, ours over all (definitions, section 5.1); its
     transform probability is the score per point.
+
+    Args:
+        nvtl: (k,) ours (`Registrations`).
+        score: (k,) sums over the points.
+        hits: (k,) points that have a cell.
+        points: (k,) or one: points that were registered.
     """
-    return found.nvtl * found.points / found.hits, found.score / found.points
+    count = np.asarray(points, np.float64)
+    return nvtl * count / hits, score / count
 
 
 NEAR_COLUMNS = (

@@ -94,6 +94,7 @@ def _table(told: dict[str, Any]) -> Table:
             f"{told['places']:,}",
             f"places, {told['without']:,} more without; routes: {told['routes']:,}",
         ),
+        ("", told["rest_on"]),
         (spread, "along x across, median standard deviation of a filter's registration"),
         (f"{told['yaw_deg']:.2f} deg", "heading, likewise"),
         (percent(told["p_lost"]), "lost in the median: they end over 50 cm away"),

@@ -168,7 +168,8 @@ def ends_of(
     found = register(cells, points, poses, settings)
     errors = start_errors(T_map_lidar, found.T_map_lidar)
     axes = np.column_stack([errors[axis] for axis in AXES])
-    return Ends(starts, errors["error"], axes, *autoware_scores(found))
+    scores = autoware_scores(found.nvtl, found.score, found.hits, found.points)
+    return Ends(starts, errors["error"], axes, *scores)
 
 
 def virtual_drive(drives: Sequence[Ends]) -> dict[str, float]:

@@ -171,6 +171,13 @@ def as_it_is(width: float) -> Calibration:
     return Calibration(np.ones(6), np.ones(6), np.zeros(6), 0.0, plain, width, 0)
 
 
+def calibration_told(calibration: Calibration | None) -> str:
+    """On what covariances rest, in words; None: of a model without, or of none."""
+    if calibration is None or not calibration.places:
+        return "not calibrated: the virtual drive as it is"
+    return f"calibrated on {calibration.places:,} labels"
+
+
 def calibrated(core: pd.DataFrame, calibration: Calibration) -> pd.DataFrame:
     """The covariances of places, in `COVARIANCE_COLUMNS`, on the index of `core` (`cores`)."""
     bias = calibration.gain * core[list(BIAS)].to_numpy()

@@ -69,9 +69,9 @@ def export(
         `spacing_m`, `prediction_error_m`, `every_m`, `correlation_length_m` (of the bias along and
         across; None: not known) and `correlation_length` (in words), `inflation` (None: not known)
         and `inflation_low` to `inflation_high`, between which it lies had other pieces of road been
-        seen (90 %; None: the road is too short to say), `inflated`, `poor_stretches`,
-        `poor_length_m`, and the medians `along_m`, `across_m`, `yaw_deg` of the standard
-        deviations, and of `p_lost`.
+        seen (90 %; None: the road is too short to say), `inflated`,
+        `rest_on` (whether they were calibrated, in words), `poor_stretches`, `poor_length_m`, and
+        the medians `along_m`, `across_m`, `yaw_deg` of the standard deviations, and of `p_lost`.
 
     Raises:
         UsageError: no such route, a value that cannot be, or a run without covariances.

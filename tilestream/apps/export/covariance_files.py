@@ -85,7 +85,13 @@ class CovarianceExport:
                 f"{self.every:g} m as independent needs {self.inflation:.2f} times these "
                 f"covariances; they {doing}."
             )
-        return [MEANT.format(self.found.prediction_error), told]
+        return [MEANT.format(self.found.prediction_error), f"They are {self.rest_on}.", told]
+
+    @property
+    def rest_on(self) -> str:
+        """Whether they were calibrated, and on how much, as the run says it."""
+        model = (open_run(self.found.run).report.get("facts") or {}).get("model") or {}
+        return str(model.get("covariances", "of a run that does not say if they were calibrated"))
 
     @property
     def worth(self) -> list[str]:
@@ -114,6 +120,7 @@ def summary(made: CovarianceExport) -> dict[str, Any]:
         "inflation": made.inflation,
         **dict(zip(("inflation_low", "inflation_high"), span, strict=True)),
         "inflated": made.inflated,
+        "rest_on": made.rest_on,
         "poor_stretches": len(poor),
         "poor_length_m": float(sum(reach[rows].sum() for rows in poor)),
         "along_m": float(spread[0]),

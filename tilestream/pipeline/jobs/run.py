@@ -21,6 +21,7 @@ import yaml
 from tilestream.errors import PartialError, counted
 from tilestream.files import place_of
 from tilestream.lock import only_writer
+from tilestream.model.covariance import calibration_told
 from tilestream.model.dataset import Dataset
 from tilestream.model.file import load_model
 from tilestream.model.shipped import file_of
@@ -264,13 +265,14 @@ def _facts(
 
 
 def _model_facts(settings: RunSettings, done: Done, by: Estimator) -> dict[str, Any]:
-    """Where the model comes from, and how it was grown."""
+    """Where the model comes from, and how it and its covariances were made."""
     along = {"averaged along the route over [m]": done.width}
     if by.untrained:
         offset = settings.model.offset or 0.0
-        return {"from": "none: the virtual drive as it is", "offset [m]": offset, **along}
-    if by.use is not None:
-        return {"from": by.use, **load_model(file_of(by.use)).facts, **along}
-    if not done.outputs("train"):
+        found = {"from": "none: the virtual drive as it is", "offset [m]": offset, **along}
+        return {**found, "covariances": calibration_told(None)}
+    if by.use is None and not done.outputs("train"):
         return {"from": "none: it could not be trained", "recipe": settings.model.recipe}
-    return {"from": "trained here", **load_model(f"{settings.out}/model.skops").facts, **along}
+    model = load_model(f"{settings.out}/model.skops" if by.use is None else file_of(by.use))
+    told = {**along, "covariances": calibration_told(model.covariance)}
+    return {"from": by.use or "trained here", **model.facts, **told}

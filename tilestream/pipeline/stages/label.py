@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from tilestream.label import FAILED, NEAR, summary
-from tilestream.moments import AXES, NEAR_COLUMNS, moments_of, scores_of
+from tilestream.moments import AXES, NEAR_COLUMNS, autoware_scores, moments_of, scores_of
 from tilestream.pipeline.engine.outputs import Made, Stored
 from tilestream.pipeline.engine.stage import stage
 from tilestream.pipeline.stages.drive_scans import Sample
@@ -151,7 +151,8 @@ def _summed(starts: pd.DataFrame, points: dict[int, int]) -> dict[str, float]:
     near = starts[distance <= NEAR + 1e-9]
     held = near["error"].to_numpy() <= FAILED
     of_scan = near["scan"].map(points).to_numpy(np.float64)
-    nvtl, tp = near["nvtl"] * of_scan / near["hits"], near["score"] / of_scan
+    nvtl, score, hits = (near[name].to_numpy() for name in ("nvtl", "score", "hits"))
+    nvtl, tp = autoware_scores(nvtl, score, hits, of_scan)
     return {
         "starts": len(starts),
         "scan_spread": float(starts.groupby("scan")["error"].mean().std()),
@@ -160,5 +161,5 @@ def _summed(starts: pd.DataFrame, points: dict[int, int]) -> dict[str, float]:
         "nvtl": float(starts["nvtl"].mean()),
         **summary(errors, distance),
         **moments_of("near", near[list(AXES)].to_numpy(), held),
-        **scores_of("near", nvtl.to_numpy(), tp.to_numpy(), held),
+        **scores_of("near", nvtl, tp, held),
     }
