@@ -380,6 +380,8 @@ def kinds(**limits: int) -> Iterator[distributed.Client]:
         for name, limit in limits.items()
     }
     with (
+        # What this process holds of earlier tests must not make a small one pause.
+        dask.config.set({"distributed.worker.memory.pause": False}),
         distributed.SpecCluster(workers, scheduler) as cluster,
         distributed.Client(cluster) as client,
     ):
