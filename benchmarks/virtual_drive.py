@@ -278,8 +278,8 @@ def compared(
         scene = Scene.of(surfels, at[None], edge_mm)
         true = np.linalg.norm(scan.points, axis=1)
         beams = np.ascontiguousarray(scan.points / true[:, None] @ scan.T_map_lidar[:3, :3].T)
-        met, cosine = np.empty(len(true)), np.empty(len(true))
-        cast(scene.bricks, at, beams, near, reach * MM_PER_M, met, cosine)
+        met, cosine, row = np.empty(len(true)), np.empty(len(true)), np.empty(len(true), np.int32)
+        cast(scene.bricks, at, beams, near, reach * MM_PER_M, met, cosine, row)
         found.append(np.column_stack([true, met]))
     return np.concatenate(found)
 

@@ -319,7 +319,8 @@ def test_a_wider_crop_of_the_map_shows_nothing_more(store: ts.TileStore) -> None
     for surfels in (everything, seen):
         scene = Scene.of(surfels, place_mm[None], 200)
         ranges, cosine = np.empty(len(beams.direction)), np.empty(len(beams.direction))
-        cast(scene.bricks, place_mm, beams.direction, 0.0, 15_000.0, ranges, cosine)
+        row = np.empty(len(beams.direction), np.int32)
+        cast(scene.bricks, place_mm, beams.direction, 0.0, 15_000.0, ranges, cosine, row)
         found.append(ranges)
     np.testing.assert_array_equal(*found)
     nothing = everything.where(np.zeros(len(everything), np.bool_))

@@ -22,6 +22,7 @@ from tilestream.factors.virtual_scan import (
     Scene,
     VirtualScan,
     look,
+    look_past,
     near_share,
     probability,
     virtual_scan,
@@ -224,7 +225,8 @@ def test_the_marching_is_that_of_the_literal_reference(seed: int) -> None:
     beams[0] = (1.0, 0.0, 0.0)
     owner, scene = owners(surfels), Scene.of(surfels, place[None], EDGE)
     ranges, cosine = np.empty(len(beams)), np.empty(len(beams))
-    cast(scene.bricks, place, beams, 0.0, 8_000.0, ranges, cosine)
+    row = np.empty(len(beams), np.int32)
+    cast(scene.bricks, place, beams, 0.0, 8_000.0, ranges, cosine, row)
     expected = [literal_range(surfels, owner, place, d) / 1000.0 for d in beams]
     np.testing.assert_allclose(ranges, expected, rtol=1e-9)
 
@@ -242,6 +244,27 @@ def street() -> Floats:
     """A short street whose coordinates are odd millimetres: on no face of the lattice."""
     points = PLACES["crossing"](np.random.default_rng(4), 16.0, 0.3)
     return (2 * np.rint(points * 500).astype(np.int64) + 1) / 1000.0
+
+
+@pytest.mark.parametrize("share", [0.0, 0.05, 0.5, 1.0])
+def test_what_is_left_out_changes_no_beam_that_met_something_else(
+    street: Floats, share: float
+) -> None:
+    place_mm, beams = np.array([8101, 303, 2001]), Beams.of(FEW, CLEAN)
+    scene = scene_of(street, place_mm)
+    whole = look(scene, place_mm, 0.3, CLEAN, beams)
+    assert ((whole[0].surfel >= 0) == np.isfinite(whole[0].ranges)).all()
+    gone = np.random.default_rng(7).random(len(scene.bricks.surfels)) < share
+    fewer = scene.without(gone)
+    (past,), (anew,) = (
+        look_past(fewer, whole, CLEAN, beams),
+        look(fewer, place_mm, 0.3, CLEAN, beams),
+    )
+    for name in ("ranges", "cosine", "surfel"):
+        np.testing.assert_array_equal(getattr(past, name), getattr(anew, name))
+    changed = past.ranges != whole[0].ranges
+    assert changed.any() == (share > 0.0)
+    assert gone[whole[0].surfel[changed]].all()
 
 
 def test_whole_voxels_of_translation_do_not_show(street: Floats) -> None:
@@ -333,8 +356,8 @@ def test_no_beam_passes_a_wall_that_was_seen_from_afar(sparse: ts.TileStore) -> 
     found, missed = everything(sparse), []
     for surfels in (found, found.where(found.radius_mm <= EDGE)):
         scene = Scene.of(surfels, place[None], EDGE)
-        ranges, cosine = np.empty(400), np.empty(400)
-        cast(scene.bricks, place, beams, 0.0, 50_000.0, ranges, cosine)
+        ranges, cosine, row = np.empty(400), np.empty(400), np.empty(400, np.int32)
+        cast(scene.bricks, place, beams, 0.0, 50_000.0, ranges, cosine, row)
         missed.append(np.isinf(ranges).mean())
     assert missed[0] < 0.1 < 0.4 < missed[1]
 

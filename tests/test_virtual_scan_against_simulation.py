@@ -39,7 +39,8 @@ def test_most_beams_end_where_those_of_the_simulator_did(tmp_path: Path) -> None
         true = np.linalg.norm(scan.points, axis=1)
         beams = np.ascontiguousarray(scan.points / true[:, None] @ scan.T_map_lidar[:3, :3].T)
         met, cosine = np.empty(len(true)), np.empty(len(true))
-        cast(scene.bricks, whole_places(place), beams, NEAR, REACH, met, cosine)
+        row = np.empty(len(true), np.int32)
+        cast(scene.bricks, whole_places(place), beams, NEAR, REACH, met, cosine, row)
         pairs.append(np.column_stack([true, met]))
     true, met = np.concatenate(pairs).T
     assert len(true) > 20_000

@@ -27,6 +27,7 @@ from tilestream.factors.virtual_scan import (
     Scene,
     VirtualScan,
     look,
+    look_past,
     near_share,
     scan_in_world,
     virtual_scan,
@@ -222,7 +223,8 @@ class _View:
         if walled > INSIDE:
             reason = WALLED.format(walled, self.seeing.range_min)
             return {"status": "failed", "reason": reason}
-        found = look(around.mapped, place_mm, heading, self.seeing, self.beams)
+        whole = look(around.scene, place_mm, heading, self.seeing, self.beams)
+        found = look_past(around.mapped, whole, self.seeing, self.beams)
         scan = virtual_scan(around.mapped, found, place_mm, self.seeing, self.beams)
         view: Row = {
             "ob_returns": scan.return_share,
@@ -235,7 +237,7 @@ class _View:
         T_map_lidar = np.eye(4)
         T_map_lidar[:2, :2] = turned_by(heading)
         T_map_lidar[:3, 3] = place_mm / MM_PER_M
-        scans = self.scans(around, found, place_mm, heading)
+        scans = self.scans(around, whole, found, place_mm)
         try:
             held = hessian_factors(around.cells, scan.points, T_map_lidar, self.registration)
             drives = self.drives(around.cells, scans, T_map_lidar)
@@ -246,17 +248,21 @@ class _View:
         return {**view, **held, **survey, **virtual_drive(drives), "status": "done", "reason": ""}
 
     def scans(
-        self, around: "_Block", found: tuple[Returns, ...], place_mm: Int64, heading: float
+        self,
+        around: "_Block",
+        whole: tuple[Returns, ...],
+        found: tuple[Returns, ...],
+        place_mm: Int64,
     ) -> Iterator[Float64]:
-        """The points of each draw, in the lidar frame: of the street as it was mapped, then of
-        others.
+        """The points of each draw, in the lidar frame: of the street as it was mapped, of which
+        the beams meet `found`, then of others; `whole` is what they would meet of all surfels.
         """
         seeing, beams = self.seeing, self.beams
         still = seeing.draws - seeing.worlds
         for draw in range(still):
             yield virtual_scan(around.mapped, found, place_mm, seeing, beams, draw).points
         for draw, scene in enumerate(around.worlds, start=still):
-            met = look(scene, place_mm, heading, seeing, beams)
+            met = look_past(scene, whole, seeing, beams)
             yield scan_in_world(met, place_mm, seeing, beams, draw)
 
     def drives(

@@ -17,6 +17,7 @@ from tilestream.kernels.virtual_scan import (
     FREE,
     VOXELS,
     Bricks,
+    Int32,
     bound_bricks,
     cast,
     fill_bricks,
@@ -159,6 +160,8 @@ class Returns:
     """(n,) of the first surfel [m]; inf: none is met."""
     cosine: Float64
     """(n,) of incidence; 0: none is met."""
+    surfel: Int32
+    """(n,) row of what is met; -1: nothing is."""
 
 
 def near_share(scene: Scene, place_mm: Int64, beams: Beams, within: float) -> float:
@@ -211,6 +214,35 @@ def look(
         _cast(scene, place_mm, heading, sensor, seeing.range_min, sensor.range_max)
         for sensor in beams.sensors
     )
+
+
+def look_past(
+    scene: Scene, found: tuple[Returns, ...], seeing: VirtualSettings, beams: Beams
+) -> tuple[Returns, ...]:
+    """The first surfels that beams meet where some are left out, from what they met with these.
+
+    The same as `look` in the scene: what met a surfel that is still there meets it again, so only
+    the others are cast.
+
+    Args:
+        scene: `Scene.without` of the one that was looked at.
+        found: what `look` met there.
+        seeing: as of `look`.
+        beams: as of `look`.
+    """
+    return tuple(
+        _past(scene, met, seeing.range_min, sensor.range_max)
+        for sensor, met in zip(beams.sensors, found, strict=True)
+    )
+
+
+def _past(scene: Scene, met: Returns, range_min: float, range_max: float) -> Returns:
+    again = np.flatnonzero((met.surfel != FREE) & scene.bricks.gone[met.surfel])
+    ranges, cosine, surfel = met.ranges.copy(), met.cosine.copy(), met.surfel.copy()
+    ranges[again], cosine[again], surfel[again] = _met(
+        scene, met.place_mm, met.direction[again], range_min, range_max
+    )
+    return Returns(met.place_mm, met.origin, met.direction, ranges, cosine, surfel)
 
 
 def virtual_scan(
@@ -310,11 +342,19 @@ def _cast(
     R_map_base = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     direction = turned(R_map_base, sensor.direction)
     offset_mm = np.rint(turned(R_map_base, sensor.origin[None])[0] * MM_PER_M).astype(np.int64)
-    ranges, cosine = np.empty(len(direction)), np.empty(len(direction))
-    at_mm, near, far = place_mm + offset_mm, range_min * MM_PER_M, range_max * MM_PER_M
-    cast(scene.bricks, at_mm, direction, near, far, ranges, cosine)
+    at_mm = place_mm + offset_mm
     origin = turned(R_map_base.T, offset_mm[None] / MM_PER_M)[0]
-    return Returns(at_mm, origin, direction, ranges, cosine)
+    return Returns(at_mm, origin, direction, *_met(scene, at_mm, direction, range_min, range_max))
+
+
+def _met(
+    scene: Scene, at_mm: Int64, direction: Float64, range_min: float, range_max: float
+) -> tuple[Float64, Float64, Int32]:
+    """Ranges, cosines and rows of what beams from a point meet, as in `Returns`."""
+    n = len(direction)
+    out = np.empty(n), np.empty(n), np.empty(n, np.int32)
+    cast(scene.bricks, at_mm, direction, range_min * MM_PER_M, range_max * MM_PER_M, *out)
+    return out
 
 
 def probability(

@@ -221,7 +221,7 @@ def _through_brick(voxels, surfels, gone, edge, brick, start, p, d, t, t_out, ne
     du = 1 if dx > 0.0 else -1
     dv = 1 if dy > 0.0 else -1
     dw = 1 if dz > 0.0 else -1
-    cosine = 0.0
+    cosine, which = 0.0, FREE
     while t <= t_out and t < best:
         s = voxels[(u * BRICK + v) * BRICK + w]
         leaves = min(tu, tv, tw)
@@ -230,7 +230,7 @@ def _through_brick(voxels, surfels, gone, edge, brick, start, p, d, t, t_out, ne
             met, miss, its_cosine = _meet(surfel, px, py, pz, dx, dy, dz)
             solid = t - ROUNDING <= met <= leaves + ROUNDING and miss < np.inf
             if near <= met < best and (miss <= 0.0 or solid):
-                best, cosine = met, its_cosine
+                best, cosine, which = met, its_cosine, s
         t = leaves
         if tu <= tv and tu <= tw:
             tu, u = tu + su, u + du
@@ -240,7 +240,7 @@ def _through_brick(voxels, surfels, gone, edge, brick, start, p, d, t, t_out, ne
             tw, w = tw + sw, w + dw
         if not (0 <= u < BRICK and 0 <= v < BRICK and 0 <= w < BRICK):
             break
-    return best, cosine
+    return best, cosine, which
 
 
 @njit(nogil=True, error_model="numpy", boundscheck=False)
@@ -252,6 +252,7 @@ def cast(
     reach: float,
     out_range: Float64,
     out_cosine: Float64,
+    out_surfel: Int32,
 ) -> None:
     """The first surfel that each beam meets.
 
@@ -266,6 +267,7 @@ def cast(
         reach: surfels farther than this are ignored [mm].
         out_range: (n,) receives the ranges [m]; inf where nothing is met.
         out_cosine: (n,) receives the cosines of incidence; 0 where nothing is met.
+        out_surfel: (n,) receives the rows of what is met; `FREE` where nothing is.
     """
     edge = bricks.edge
     size = np.int64(BRICK * edge)
@@ -288,7 +290,7 @@ def cast(
         di = 1 if dx > 0.0 else -1
         dj = 1 if dy > 0.0 else -1
         dk = 1 if dz > 0.0 else -1
-        t, best, cosine = 0.0, np.inf, 0.0
+        t, best, cosine, which = 0.0, np.inf, 0.0, FREE
         while t < best and t <= reach:
             gi, gj, gk = i + i0, j + j0, k + k0
             if not (0 <= gi < nx and 0 <= gj < ny and 0 <= gk < nz):
@@ -301,7 +303,7 @@ def cast(
                 begin, end = _slab(box[0], box[3], px, ix, begin, end)
                 begin, end = _slab(box[1], box[4], py, iy, begin, end)
                 if begin <= end:
-                    met, its_cosine = _through_brick(
+                    met, its_cosine, its_row = _through_brick(
                         voxels[np.uint64(b)],
                         surfels,
                         bricks.gone,
@@ -316,7 +318,7 @@ def cast(
                         best,
                     )
                     if met < best:
-                        best, cosine = met, its_cosine
+                        best, cosine, which = met, its_cosine, its_row
             t = t_out
             if ti <= tj and ti <= tk:
                 ti, i = ti + si, i + di
@@ -327,6 +329,7 @@ def cast(
         met = best <= reach
         out_range[n] = best / 1000.0 if met else np.inf
         out_cosine[n] = cosine if met else 0.0
+        out_surfel[n] = which if met else FREE
 
 
 @njit(nogil=True, error_model="numpy")
