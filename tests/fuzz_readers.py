@@ -36,7 +36,8 @@ from tilestream.matcher import RegistrationSettings
 from tilestream.model.file import load_model, save_model
 from tilestream.model.forest import Growth, PaperForest
 from tilestream.model.training import predict, train
-from tilestream.pipeline.jobs.inventory import INVENTORY, Entry, inventory_of, write_inventory
+from tilestream.pipeline.jobs.inventory import Entry, inventory_of, write_inventory
+from tilestream.pipeline.jobs.run_names import INVENTORY
 from tilestream.pipeline.jobs.run_settings import read_settings
 from tilestream.records import Column
 from tilestream.sensor import sensor_of

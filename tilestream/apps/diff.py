@@ -18,9 +18,10 @@ from tilestream.from_above import FromAbove, above_table, seen_from_above
 from tilestream.grid import Box, TileKey
 from tilestream.notes import Notes, noticed
 from tilestream.pipeline.jobs.run_before import REPORT, before_update, told_in
-from tilestream.pipeline.jobs.run_book import RECORD, told_before
+from tilestream.pipeline.jobs.run_book import told_before
 from tilestream.pipeline.jobs.run_findings import MOST_PIXELS
 from tilestream.pipeline.jobs.run_folder import map_of, stores_named
+from tilestream.pipeline.jobs.run_names import RECORD
 from tilestream.pipeline.jobs.sources import map_notes
 from tilestream.records import Float64
 from tilestream.report.data import BESIDE

@@ -32,9 +32,10 @@ from tilestream.model.covariance import COVARIANCE_COLUMNS
 from tilestream.model.join import ON_PATH
 from tilestream.model.training import ESTIMATES, MAIN, PREDICTION_COLUMNS
 from tilestream.notebook import axes_of, html_of
-from tilestream.pipeline.jobs.run_book import ENDED, RECORD, told_before
+from tilestream.pipeline.jobs.run_book import ENDED, told_before
 from tilestream.pipeline.jobs.run_folder import map_of, rows_of, table_paths
 from tilestream.pipeline.jobs.run_inputs import seen_otherwise
+from tilestream.pipeline.jobs.run_names import RECORD
 from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.records import Float64
 from tilestream.report.colours import FIXED, MISSING, scale_of

@@ -12,8 +12,9 @@ from tilestream.errors import DamagedError, TilestreamError, UsageError
 from tilestream.files import Files, place_of
 from tilestream.lock import only_writer
 from tilestream.marks import unsealed
-from tilestream.pipeline.jobs.inventory import INVENTORY, Entry, inventory_of
-from tilestream.pipeline.jobs.run_book import RECORD, checksum_of
+from tilestream.pipeline.jobs.inventory import Entry, inventory_of
+from tilestream.pipeline.jobs.run_book import checksum_of
+from tilestream.pipeline.jobs.run_names import INVENTORY, RECORD
 from tilestream.pipeline.stages.label import label
 from tilestream.store import NODE, POINTS, Tile, open_store
 from tilestream.tables import read_mark, read_tables

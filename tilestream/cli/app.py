@@ -52,7 +52,7 @@ COMMANDS = {
         "Read everything that is stored there; list what is damaged, half-made or lost.",
     ),
     "info": (
-        "maps",
+        "describing",
         "Show what is in anything that is read or made: extent, CRS, coverage, state, notes.",
     ),
     "localize": (

@@ -22,8 +22,9 @@ from tilestream.pipeline.jobs import run as main_job
 from tilestream.pipeline.jobs import simulate as simulation
 from tilestream.pipeline.jobs.estimate import OUT, estimate_settings
 from tilestream.pipeline.jobs.forecast import forecast
-from tilestream.pipeline.jobs.run_book import RECORD, told_before
+from tilestream.pipeline.jobs.run_book import told_before
 from tilestream.pipeline.jobs.run_inputs import check_files, extent, simulations
+from tilestream.pipeline.jobs.run_names import RECORD
 from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
 from tilestream.pipeline.stages.simulated import SCENE_BYTES
 from tilestream.records import District

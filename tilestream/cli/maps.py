@@ -1,4 +1,4 @@
-"""The commands about maps and files: make a tile store, look into one, compare two."""
+"""The commands about maps: make a tile store, look into one, compare two."""
 
 from dataclasses import asdict
 from typing import Annotated, Any
@@ -6,7 +6,6 @@ from typing import Annotated, Any
 import typer
 
 from tilestream.apps import diff as map_diff
-from tilestream.apps import info as describing
 from tilestream.apps import verify as verifying
 from tilestream.cli.cluster import HERE, Cluster, on_cluster
 from tilestream.cli.fields import fields, with_settings
@@ -15,8 +14,6 @@ from tilestream.cli.printing import err, out, print_json, say, say_notes
 from tilestream.cli.progress import progress
 from tilestream.cli.tables import (
     diff_table,
-    ends_table,
-    info_table,
     plan_table,
     stretch_table,
     tile_table,
@@ -28,12 +25,11 @@ from tilestream.pipeline.jobs.map_expected import tiles_to_read
 from tilestream.pipeline.jobs.map_update import Update, tiles_written
 from tilestream.pipeline.jobs.run_inputs import ingest_settings, scans_of
 from tilestream.pipeline.jobs.sources import map_notes
-from tilestream.pipeline.jobs.starts_of import starts_of as ends_of
 from tilestream.report import diff_gate, write_diff
 from tilestream.report.diff.data import WORSE
 from tilestream.report.diff.gate import DiffGateSettings
 from tilestream.report.diff.summary import diff_content
-from tilestream.settings import IngestSettings, LogOptions, LogSettings, MapSettings, PlaceSettings
+from tilestream.settings import IngestSettings, LogSettings, MapSettings, PlaceSettings
 from tilestream.store import POINTS, TileStore, open_store
 
 
@@ -164,38 +160,6 @@ def _why_left(damage: verifying.Damage) -> str:
     """Why something damaged cannot be removed, as far as that is not clear."""
     missing = verifying.gone(damage)
     return f"; made from {missing[0]}, which is gone" if missing else ""
-
-
-@with_settings
-def info(
-    file: Annotated[
-        str,
-        typer.Argument(help="Points, a log, routes, a map folder, a store, a run, or a model."),
-    ],
-    log: Annotated[LogOptions, fields(*LogOptions.model_fields)],
-    starts_of: Annotated[
-        int | None,
-        typer.Option(
-            help="Of a run or of the tables of `localize`: where the starts of this sample point "
-            "of a drive began and ended."
-        ),
-    ] = None,
-    of_drive: Annotated[str, typer.Option(help="Its drive, where a run has several.")] = "",
-    as_json: AsJson = False,
-) -> None:
-    """Show what is in anything that is read or made: extent, CRS, coverage, state, notes."""
-    if starts_of is not None:
-        rows = ends_of(file, starts_of, of_drive)
-        if as_json:
-            print_json(rows.to_dict("records"))
-        else:
-            out.print(ends_table(rows))
-        return
-    found = describing.info(file, log)
-    if as_json:
-        print_json(found.plain())
-    else:
-        out.print(info_table(found))
 
 
 @with_settings

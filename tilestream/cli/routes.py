@@ -10,7 +10,8 @@ from tilestream.apps import compare as comparing
 from tilestream.apps.choices import choices_of
 from tilestream.cli.cluster import HERE, Cluster, on_cluster
 from tilestream.cli.fields import fields, flag, options_named, was_given, with_settings
-from tilestream.cli.options import AsJson, DryRun, Routes, StoreUrl, numbers, routes_of
+from tilestream.cli.given_routes import routes_of
+from tilestream.cli.options import AsJson, DryRun, Routes, StoreUrl, numbers
 from tilestream.cli.printing import out, print_json, say, say_notes
 from tilestream.cli.progress import progress
 from tilestream.cli.tables import (

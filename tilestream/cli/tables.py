@@ -8,10 +8,7 @@ import pandas as pd
 from rich.box import SIMPLE
 from rich.table import Table
 
-from tilestream.apps.info import Info
-from tilestream.crs import named
 from tilestream.factors.catalogue import COLUMNS
-from tilestream.label import FAILED
 from tilestream.pipeline.engine.plan import Plan, megabytes
 from tilestream.report.diff.data import TILES, MapDiff
 from tilestream.report.drives import DriveMeasured
@@ -66,71 +63,6 @@ def forecast_table(rows: list[dict[str, object]]) -> Table:
         "all", str(sum(int(str(row["tasks"])) for row in rows)), "", "", "", f"{total:.3f}", ""
     )
     return table
-
-
-def info_table(found: Info) -> Table:
-    """What is in a file, or in what we have made, a line per fact."""
-    table = Table(show_header=False, title=found.path, title_justify="left", box=SIMPLE)
-    table.add_row("what", f"{found.kind}: {found.format}")
-    table.add_row("state", found.state)
-    if found.size_bytes is not None:
-        table.add_row("size", f"{found.size_bytes:,} bytes")
-    if found.fields:
-        table.add_row("fields", ", ".join(f"{name}: {kind}" for name, kind in found.fields))
-    if found.kind != "model":
-        table.add_row("CRS", "none is named" if found.crs is None else named(found.crs))
-    for name, frame in found.frames.items():
-        table.add_row(f"frame of {name}", frame or "not named")
-    for name, told in (*_extent(found), *_coverage(found)):
-        table.add_row(name, told)
-    for line in found.contents:
-        table.add_row("holds", line)
-    for note in found.notes:
-        table.add_row("note", note)
-    return table
-
-
-ENDS = ("from_along", "from_across", "along", "across", "up", "error")
-"""What is told of each start [m]."""
-
-
-def ends_table(rows: pd.DataFrame) -> Table:
-    """Where the starts of a place began and ended, a line per start."""
-    failed = int((rows["error"] > FAILED).sum())
-    title = f"{len(rows)} starts of sample point {rows['sample'].iloc[0]}, {failed} failed"
-    table = Table(title=title, title_justify="left", box=SIMPLE)
-    for name in ("scan", "start", *(f"{name} [m]" for name in ENDS), "converged"):
-        table.add_column(name, justify="right")
-    for row in rows.to_dict("records"):
-        lengths = (f"{row[name]:.3f}" for name in ENDS)
-        converged = "yes" if row["converged"] else "no"
-        table.add_row(str(row["scan"]), str(row["start"]), *lengths, converged)
-    return table
-
-
-def _extent(found: Info) -> list[tuple[str, str]]:
-    """From where to where it reaches: millimetres, or what they are in degrees."""
-    if found.bounds is None:
-        return []
-    digits = 8 if found.unit == "degrees" else 3
-    lowest, highest = (
-        "  ".join("no z" if math.isnan(value) else f"{value:.{digits}f}" for value in corner)
-        for corner in found.bounds
-    )
-    told = "none" if found.heights is None else "{:.3f} to {:.3f} m".format(*found.heights)
-    unit = f"[{found.unit}]"
-    return [(f"lowest {unit}", lowest), (f"highest {unit}", highest), ("heights", told)]
-
-
-def _coverage(found: Info) -> list[tuple[str, str]]:
-    """How much of it there is."""
-    rows = []
-    if found.points is not None and found.kind != "run":
-        rows.append(("points", f"{found.points:,}"))
-    for name, value in found.coverage.items():
-        shown = f"{value:.1f}" if isinstance(value, float) else str(value)
-        rows.append((name.replace("_", " "), shown))
-    return rows
 
 
 def factor_table(rows: pd.DataFrame) -> Table:

@@ -1,22 +1,18 @@
 """What is in anything that tilestream reads or writes: one function for each kind of it.
 
-A new kind is a function that describes it, and a line in `KINDS`.
+A new kind is a file that describes it, and a line in `KINDS`.
 """
 
 import os
 
-from tilestream.apps.info.files import KINDS as OF_FILES
-from tilestream.apps.info.made import KINDS as OF_MADE
-from tilestream.apps.info.record import Info, Kind
+from tilestream.apps.info.kinds import KINDS
+from tilestream.apps.info.record import Info
 from tilestream.errors import UnknownFormatError
 from tilestream.files import Files
 from tilestream.formats import describe
 from tilestream.settings import LogOptions
 
 __all__ = ["KINDS", "Info", "info"]
-
-KINDS: tuple[Kind, ...] = (*OF_MADE, *OF_FILES)
-"""What can be described; the first that fits is it."""
 
 
 def info(path: str | os.PathLike[str], log_options: LogOptions | None = None) -> Info:

@@ -1,6 +1,6 @@
 """What is told of anything: one record for all kinds, with the same names in `--json`."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from typing import Any
@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from tilestream.formats.base import Bounds, Corner
+from tilestream.notes import Notes, shared
 from tilestream.records import Float64
-from tilestream.settings import LogOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,23 +66,16 @@ class Info:
         return replace(self, bounds=(low, high), heights=heights_of((low, high)))
 
 
-@dataclass(frozen=True)
-class Kind:
-    """Something that can be described."""
-
-    name: str
-    """What it is, in words."""
-    fits: Callable[[str, frozenset[str]], bool]
-    """Whether a path is one, by its name and the names of what lies in it."""
-    describe: Callable[[str, LogOptions], Info]
-    """What is in it, logs read as these options say."""
-
-
 def heights_of(bounds: Bounds | None) -> tuple[float, float] | None:
     """The z of bounds; None: there is none."""
     if bounds is None or not np.isfinite([bounds[0][2], bounds[1][2]]).all():
         return None
     return bounds[0][2], bounds[1][2]
+
+
+def told(notes: Notes) -> list[str]:
+    """Notes as lines, alike ones together."""
+    return [str(note) for note in shared(notes)]
 
 
 def utc(stamp_ns: int) -> str:

@@ -18,12 +18,11 @@ from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.outputs import Parquet, TileArrays, way_to
 from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.engine.stage import Task
+from tilestream.pipeline.jobs.run_names import INVENTORY
 from tilestream.pipeline.stages.drive_scans import DriveScans, Sample
 from tilestream.pipeline.stages.map_part import MapPart
 from tilestream.store import require_folder
 from tilestream.tables import read_mark
-
-INVENTORY = "inventory.json"
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,6 @@ from tilestream.pipeline.jobs.estimator import Estimator
 from tilestream.pipeline.jobs.inventory import settle
 from tilestream.pipeline.jobs.run_before import tell
 from tilestream.pipeline.jobs.run_book import (
-    RECORD,
     Book,
     checksums,
     machine,
@@ -50,6 +49,7 @@ from tilestream.pipeline.jobs.run_inputs import (
     seen_otherwise,
 )
 from tilestream.pipeline.jobs.run_lanes import lanelet_maps_of
+from tilestream.pipeline.jobs.run_names import RECORD
 from tilestream.pipeline.jobs.run_notes import (
     drives_measured,
     log_poses_told,

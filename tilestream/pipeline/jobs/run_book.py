@@ -20,10 +20,9 @@ from tilestream.marks import sealed, unsealed
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.engine.stage import Task
+from tilestream.pipeline.jobs.run_names import RECORD
 from tilestream.version import VERSION
 
-RECORD = "run.json"
-"""The file of the record."""
 ENDED = ("done", "failed")
 """What a run says of itself whose report is of its tables."""
 WRITE_EVERY = 30.0

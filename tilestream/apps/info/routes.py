@@ -1,13 +1,10 @@
-"""What is in files that others have made: points, logs, routes."""
+"""What is in a file of routes, in its own coordinates; lengths in metres."""
 
 from pathlib import Path
 
 import numpy as np
 
-from tilestream.apps.info.record import Info, Kind, heights_of, utc
-from tilestream.formats import FORMATS, describe
-from tilestream.formats.logs import is_log, open_log
-from tilestream.formats.registry import format_of_directory, format_of_ending
+from tilestream.apps.info.record import Info
 from tilestream.formats.routes import READERS, read_all_routes
 from tilestream.formats.routes.base import Path3
 from tilestream.formats.routes.degrees import in_degrees
@@ -15,54 +12,10 @@ from tilestream.records import Float64
 from tilestream.settings import LogOptions
 
 ROUTES = {".osm": "Lanelet2", ".geojson": "GeoJSON", ".json": "GeoJSON", ".csv": "CSV"}
-"""Names of the formats of routes, by ending; all others are poses."""
+"""Names of the formats, by ending; all others are poses."""
 
 
-def _of_points(path: str, _: LogOptions) -> Info:
-    """A file of points, or a map directory."""
-    found = describe(path)
-    return Info(
-        path=found.path,
-        kind="points",
-        format=found.format,
-        size_bytes=found.size_bytes,
-        crs=found.crs,
-        bounds=found.bounds,
-        heights=heights_of(found.bounds),
-        points=found.points,
-        fields=found.fields,
-        contents=found.contents,
-        notes=found.notes,
-    )
-
-
-def _of_log(path: str, options: LogOptions) -> Info:
-    """A log: its scans, their poses, and the map that they would make."""
-    log, found = open_log(path, options), describe(path, **options.given)
-    return Info(
-        path=found.path,
-        kind="log",
-        format=found.format,
-        size_bytes=found.size_bytes,
-        frames={"scans": log.frame},
-        bounds=found.bounds,
-        heights=heights_of(found.bounds),
-        points=found.points,
-        fields=found.fields,
-        coverage={
-            "length_m": log.length_m(np.arange(len(log))),
-            "scans": len(log),
-            "scans_with_pose": int(log.posed.sum()),
-            "poses": len(log.trajectory.stamps_ns),
-            "from": utc(int(log.stamps_ns[0])),
-            "until": utc(int(log.stamps_ns[-1])),
-        },
-        contents=found.contents,
-        notes=found.notes,
-    )
-
-
-def _of_routes(path: str, _: LogOptions) -> Info:
+def described(path: str, _: LogOptions) -> Info:
     """A file of routes, in its own coordinates; lengths in metres."""
     ending = Path(path).suffix.lower()
     drawn = [part for part in READERS[ending](path) if isinstance(part, Path3)]
@@ -105,19 +58,3 @@ def _here(degrees: Float64) -> str:
     middle = degrees[np.isfinite(degrees[:, :2]).all(axis=1), :2].mean(axis=0)
     longitude, latitude = np.clip(middle, (-180.0, -89.0), (180.0, 89.0))  # others are refused
     return f"+proj=tmerc +lon_0={longitude:.4f} +lat_0={latitude:.4f} +k=1 +datum=WGS84 +units=m"
-
-
-def _is_points(path: str, _: frozenset[str]) -> bool:
-    known = format_of_ending(path, FORMATS) or format_of_directory(path, FORMATS)
-    return known is not None and not is_log(path)
-
-
-KINDS = (
-    Kind("logs of drives", lambda path, _: is_log(path), _of_log),
-    Kind("files and folders of points", _is_points, _of_points),
-    Kind(
-        "files of routes",
-        lambda path, _: Path(path).is_file() and Path(path).suffix.lower() in READERS,
-        _of_routes,
-    ),
-)
