@@ -127,11 +127,12 @@ def read_tables(paths: Sequence[str]) -> pd.DataFrame:
     """
     if not paths:
         raise SourceNotFoundError("no tables: the job that writes them has not run here")
-    rows: pd.DataFrame = pd.concat([_read(path) for path in paths], ignore_index=True)
+    table = pa.concat_tables([_read(path) for path in paths], promote_options="permissive")
+    rows: pd.DataFrame = table.to_pandas()
     return rows
 
 
-def _read(path: str) -> pd.DataFrame:
+def _read(path: str) -> pa.Table:
     try:
         content = Files.at(path).read()
     except FileNotFoundError:
@@ -140,6 +141,5 @@ def _read(path: str) -> pd.DataFrame:
     bare = content[:at] + _UNKNOWN + content[at + 8 :]
     if at < 0 or content[at : at + 8] != b"%08x" % zlib.crc32(bare):
         raise DamagedError(f"{path} is damaged, its checksum does not fit: {AGAIN}")
-    read = pq.read_table(io.BytesIO(content), page_checksum_verification=True)
-    frame: pd.DataFrame = read.to_pandas()
-    return frame
+    # `read_table` would look for a whole data set, which takes half as long again
+    return pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True).read()

@@ -269,7 +269,8 @@ class TileStore:
 
         Empty until an ingest has ended.
         """
-        return [source_of(self.files, source) for source in read_record(self.url).sources]
+        here = os.path.realpath(self.files.root) if self.files.local else None
+        return [source_of(here, source) for source in read_record(self.url).sources]
 
     def made_by(self) -> dict[str, int]:
         """The stages that made the map, with their versions; empty until an ingest has ended."""

@@ -65,14 +65,15 @@ def way_of(files: Files, path: str) -> str | None:
         return None
 
 
-def source_of(files: Files, known: Mapping[str, Any]) -> dict[str, Any]:
-    """A source as the record of the store that lies there has it, `path` being where it is now:
-    where it is seen from the store, as long as it is there, else where it was.
+def source_of(store: str | None, known: Mapping[str, Any]) -> dict[str, Any]:
+    """A source as the record of the store that lies there, on a disk or not (None), has it, `path`
+    being where it is now: where it is seen from the store, as long as it is there, else where it
+    was.
     """
     source = dict(known)
     way = source.pop("way", None)  # which a record of before does not have
-    if way is not None and files.local:
-        now = os.path.normpath(os.path.join(os.path.realpath(files.root), way))  # noqa: PTH118
+    if way is not None and store is not None:
+        now = os.path.normpath(os.path.join(store, way))  # noqa: PTH118
         if os.path.realpath(source["path"]) != now and Path(now).exists():
             source["path"] = now
     return source

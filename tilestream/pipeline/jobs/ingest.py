@@ -26,6 +26,9 @@ from tilestream.store import StoreSettings, TileStore, open_store
 
 logger = logging.getLogger(__name__)
 
+Recorded = list[dict[str, Any]]
+"""The sources that a store knows."""
+
 
 def ingest(
     sources: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
@@ -123,7 +126,7 @@ def read_sources(
         require_some(found)
         store = TileStore.create(url, wanted)
     recorded = _recorded(store, found)
-    reading = _reading(store, found, memory)
+    reading = _reading(store, found, recorded, memory)
     for path in reading.gone:
         logger.warning("%s %s", path, GONE)
     if reading.current and recorded != store.sources():
@@ -131,11 +134,11 @@ def read_sources(
     return reading
 
 
-def _reading(store: TileStore, found: Sequence[Source], memory: int) -> Reading:
-    """What is to be read of sources, of a store that is there."""
-    current = _is_current(store, found)
-    as_before = {} if current else remembered(store, found, _recorded(store, found))
-    gone = _gone(store, found)
+def _reading(store: TileStore, found: Sequence[Source], recorded: Recorded, memory: int) -> Reading:
+    """What is to be read of sources, of a store that is there and knows those that it is of."""
+    current = _is_current(store, found, recorded)
+    as_before = {} if current else remembered(store, found, recorded)
+    gone = _gone(found, recorded)
     return Reading(store, found, memory, current=current, remembered=as_before, gone=gone)
 
 
@@ -164,7 +167,7 @@ def plan_ingest(
     there = _there(str(url), wanted, found)
     if there is None:
         return Reading(TileStore(str(url), wanted), found, memory)
-    return _reading(there, found, memory)
+    return _reading(there, found, _recorded(there, found), memory)
 
 
 def _there(url: str, wanted: StoreSettings, found: Sequence[Source]) -> TileStore | None:
@@ -184,7 +187,7 @@ def _there(url: str, wanted: StoreSettings, found: Sequence[Source]) -> TileStor
                 f"{url} has {name} {there!r}, asked for is {value!r}: "
                 "use the same setting, or another path for the new store"
             )
-    forgotten = [path for path in _absent(store, found) if Path(path).exists()]
+    forgotten = [path for path in _absent(found, _recorded(store, found)) if Path(path).exists()]
     if forgotten:
         raise UsageError(
             f"{url} was also made from {', '.join(forgotten)}: give all sources of the map, move "
@@ -193,17 +196,17 @@ def _there(url: str, wanted: StoreSettings, found: Sequence[Source]) -> TileStor
     return store
 
 
-def _absent(store: TileStore, found: Sequence[Source]) -> list[str]:
+def _absent(found: Sequence[Source], recorded: Recorded) -> list[str]:
     """The sources that a store knows and that were not given."""
     given = {source.path for source in found}
-    return sorted({s["path"] for s in _recorded(store, found)} - given)
+    return sorted({source["path"] for source in recorded} - given)
 
 
-def _gone(store: TileStore, found: Sequence[Source]) -> list[str]:
+def _gone(found: Sequence[Source], recorded: Recorded) -> list[str]:
     """The sources of a store that were not given, by any name that they may have now."""
-    known = {record["path"]: record["state"] for record in _recorded(store, found)}
+    known = {source["path"]: source["state"] for source in recorded}
     renamed = {source.state for source in found if source.path not in known}
-    return [path for path in _absent(store, found) if known[path] not in renamed]
+    return [path for path in _absent(found, recorded) if known[path] not in renamed]
 
 
 def require_some(found: Sequence[Source]) -> None:
@@ -217,7 +220,7 @@ def require_some(found: Sequence[Source]) -> None:
         raise SourceError(several + found[0].reason)
 
 
-def _recorded(store: TileStore, found: Sequence[Source]) -> list[dict[str, Any]]:
+def _recorded(store: TileStore, found: Sequence[Source]) -> Recorded:
     """The sources that a store knows, each under the path that it was found by.
 
     It is known by the file that the path leads to; where nothing is there any more, by name and
@@ -240,10 +243,10 @@ def _fits(asked: str | None, there: str | None) -> bool:
     return asked is None or (there is not None and same(asked, there))
 
 
-def _is_current(store: TileStore, found: Sequence[Source]) -> bool:
+def _is_current(store: TileStore, found: Sequence[Source], recorded: Recorded) -> bool:
     """Whether the store is whole, and made from exactly these sources by these stages."""
-    recorded = {(s["path"], s["state"]) for s in _recorded(store, found) if not s["reason"]}
-    if recorded != {(s.path, s.state) for s in found} or store.made_by() != MADE_BY:
+    known = {(s["path"], s["state"]) for s in recorded if not s["reason"]}
+    if known != {(s.path, s.state) for s in found} or store.made_by() != MADE_BY:
         return False
     condition = store.condition()
     return condition.whole and all(mark.status == "done" for mark in condition.marks.values())
