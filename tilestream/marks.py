@@ -7,6 +7,7 @@ import os
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -90,25 +91,31 @@ def identity_of(
     return hash_of(stage, version, takes, reads)
 
 
+@lru_cache
+def _name_of(dtype: np.dtype[Any]) -> str:
+    """How numpy writes a type, which takes it long for records."""
+    return str(dtype)
+
+
 def canonical(value: Any) -> Any:
     """A value as JSON holds it: settings and records by field, arrays by the hash of their bytes.
 
     Raises:
         TypeError: a value of a type that has no such form.
     """
-    if type(value) in PLAIN:  # most values of a plan
+    if type(value) in PLAIN:  # most values of a plan are …
         return value
+    if isinstance(value, tuple | list):  # … or these
+        return [inner if type(inner) is str else canonical(inner) for inner in value]
     if isinstance(value, BaseModel):
         return canonical(value.model_dump())
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: canonical(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, Mapping):
         return {str(name): canonical(inner) for name, inner in value.items()}
-    if isinstance(value, tuple | list):
-        return [canonical(inner) for inner in value]
     if isinstance(value, np.ndarray):
         digest = hashlib.blake2b(np.ascontiguousarray(value).tobytes(), digest_size=16)
-        return [str(value.dtype), list(value.shape), digest.hexdigest()]
+        return [_name_of(value.dtype), list(value.shape), digest.hexdigest()]
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, os.PathLike):

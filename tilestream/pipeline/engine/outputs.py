@@ -88,7 +88,7 @@ class TileArrays:
         return Tile(open_store(self.store_url), self.tile)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Parquet:
     """A table with documented columns in a file of its own."""
 

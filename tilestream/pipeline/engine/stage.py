@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any, Protocol
 
 from tilestream.grid import TileKey
@@ -104,9 +103,9 @@ Reads = Mapping[str, Readable | tuple[Readable, ...]]
 """What a function reads, by argument."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class Task:
-    """A stage applied to something: a frozen piece of work."""
+    """A stage applied to something: a frozen piece of work. A plan holds millions of them."""
 
     applies: Stage
     """What it does."""
@@ -124,20 +123,26 @@ class Task:
     """How much it is expected to read."""
     tile: TileKey | None = None
     """The tile that it belongs to, as the dashboard shows it."""
+    key: str = field(init=False)
+    """Unique name, `stage-…`, as the dashboard shows it."""
+    _identity: str = field(init=False, repr=False, default="")
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "key", f"{self.applies.name}-{self.name}")
 
     @property
     def stage(self) -> str:
         """Name of the stage."""
         return self.applies.name
 
-    @cached_property
-    def key(self) -> str:
-        """Unique name, `stage-…`, as the dashboard shows it."""
-        return f"{self.stage}-{self.name}"
-
-    @cached_property
+    @property
     def identity(self) -> str:
         """Hash of all that its result depends on."""
+        if not self._identity:
+            object.__setattr__(self, "_identity", self._hashed())
+        return self._identity
+
+    def _hashed(self) -> str:
         inputs = {name: [one.identity for one in _all(read)] for name, read in self.reads.items()}
         return identity_of(self.stage, self.applies.version, self.takes, inputs)
 
