@@ -1,3 +1,3 @@
 """The version of the code, recorded in every mark that a finished piece of work carries."""
 
-VERSION = "0.1.0"
+VERSION = "0.2.0"
