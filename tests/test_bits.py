@@ -100,6 +100,14 @@ def test_products_and_sums_of_rows_round_by_the_row_alone(
     np.testing.assert_allclose(norms(values), np.linalg.norm(values, axis=1), rtol=1e-14)
 
 
+@given(seed=SEEDS)
+@settings(max_examples=10)
+def test_a_motion_rounds_as_rotation_and_shift_do(seed: int) -> None:
+    T, points = poses(seed)[0], np.random.default_rng(seed).normal(size=(MOST, 3)) * 50.0
+    points[3, 1] = np.nan
+    np.testing.assert_array_equal(transform(T, points), turned(T[:3, :3], points) + T[:3, 3])
+
+
 # --- Every table
 
 

@@ -13,7 +13,9 @@ from scenes import UTM, scene
 
 from tilestream.errors import UsageError
 from tilestream.kernels import cells as kernels
-from tilestream.ndt import cells_of, cells_of_mm, to_mm
+from tilestream.kernels.bounds import bounds
+from tilestream.kernels.eigen import LANES, eigen
+from tilestream.ndt import cells_of, cells_of_mm
 from tilestream.records import Cells
 
 Floats = NDArray[np.float64]
@@ -149,7 +151,7 @@ def test_order_does_not_matter(cell_size: float) -> None:
 
 @pytest.mark.parametrize("tile_mm", [2000, 8000, 100_000])
 def test_tiles_together_are_the_map(tile_mm: int) -> None:
-    points_mm = to_mm(scene("diagonal", seed=5, offset=UTM))
+    points_mm = np.rint(scene("diagonal", seed=5, offset=UTM) * 1000.0).astype(np.int64)
     tiles = np.unique(points_mm[:, :2] // tile_mm, axis=0)
     parts = [
         cells_of_mm(points_mm[(points_mm[:, :2] // tile_mm == tile).all(axis=1)], 2000)
@@ -168,7 +170,23 @@ def test_utm_coordinates_lose_nothing() -> None:
 
 
 def test_millimetres_are_rounded_half_to_even() -> None:
-    assert to_mm([[0.0005, 0.0015, -0.0025]]).tolist() == [[0, 2, -2]]
+    halves, whole = [[0.0005, 0.0015, -0.0025]] * 2, [[0.0, 0.002, -0.002]] * 2
+    assert same_bits(cells_of(halves, 0.004, 2), cells_of(whole, 0.004, 2))
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.int64, np.int32])
+@pytest.mark.parametrize("at", [0, 1, -1])
+def test_the_bounds_of_points_are_those_of_numpy(dtype: type, at: int) -> None:
+    points = np.random.default_rng(0).integers(-(10**9), 10**9, (1000, 3)).astype(dtype)
+    points[at] = [10**9, -(10**9), 10**9]
+    np.testing.assert_array_equal(bounds(points), [points.min(axis=0), points.max(axis=0)])
+
+
+@pytest.mark.parametrize("row", [0, 3, 999])
+def test_points_that_are_not_numbers_have_no_bounds(row: int) -> None:
+    points = np.random.default_rng(0).normal(size=(1000, 3))
+    points[row, row % 3] = np.nan
+    assert np.isnan(bounds(points)).all()
 
 
 # --- Eigenvalues, normals, inverse
@@ -186,7 +204,7 @@ def random_covariances(n: int, seed: int = 0) -> Floats:
 @pytest.mark.interpreted
 def test_eigenvalues_are_those_of_lapack() -> None:
     covariance = random_covariances(400)
-    values, vectors = kernels.eigen(covariance)
+    values, vectors = eigen(covariance)
     expected = np.maximum(np.linalg.eigvalsh(covariance)[:, ::-1], 0.0)
     scale = np.maximum(expected[:, :1], 1e-300)
     assert (np.abs(values - expected) / scale).max() < 5e-15
@@ -198,16 +216,24 @@ def test_eigenvalues_are_those_of_lapack() -> None:
     assert np.abs(eye - np.eye(3)).max() < 5e-15
 
 
+@pytest.mark.parametrize("company", [2, LANES, LANES + 1, 3 * LANES - 1])
+def test_a_matrix_has_the_same_axes_in_any_company(company: int) -> None:
+    covariance = random_covariances(company, seed=1)
+    together, alone = eigen(covariance), [eigen(one[None]) for one in covariance]
+    for part in range(2):
+        assert together[part].tobytes() == b"".join(found[part].tobytes() for found in alone)
+
+
 @pytest.mark.interpreted
 @pytest.mark.parametrize("lam", [(0, 0, 0), (1, 0, 0), (0, 0, 2), (1, 1, 0), (3, 3, 3), (1, 2, 3)])
 def test_eigenvalues_of_diagonal_matrices_are_exact(lam: tuple[int, int, int]) -> None:
-    values, vectors = kernels.eigen(np.diag(np.array(lam, float))[None])
+    values, vectors = eigen(np.diag(np.array(lam, float))[None])
     assert values[0].tolist() == sorted(lam, reverse=True)
     assert np.abs(vectors[0].T @ vectors[0]).tolist() == np.eye(3).tolist()
 
 
 def test_a_negative_eigenvalue_is_rounding_and_counts_as_zero() -> None:
-    values, _ = kernels.eigen(np.diag([1.0, 1e-3, -1e-18])[None])
+    values, _ = eigen(np.diag([1.0, 1e-3, -1e-18])[None])
     assert values[0].tolist() == [1.0, 1e-3, 0.0]
 
 
@@ -253,7 +279,7 @@ def test_a_wall_has_one_normal_whatever_its_cells(angle_deg: int) -> None:
 @pytest.mark.interpreted
 def test_the_regularised_covariance_has_its_floors_and_its_inverse() -> None:
     covariance = random_covariances(200, seed=9)
-    values, vectors = kernels.eigen(covariance)
+    values, vectors = eigen(covariance)
     regular, inverse = kernels.regularise(values, vectors)
     floors = np.maximum(values, np.maximum(0.01 * values[:, :1], 1e-4))
     expected = vectors * floors[:, None, :] @ vectors.transpose(0, 2, 1)

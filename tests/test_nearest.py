@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tilestream.kernels.cells import cell_of_points, cell_sums, eigen, moments, regularise
+from tilestream.kernels.cells import cell_of_points, cell_sums, moments, regularise
+from tilestream.kernels.eigen import eigen
 from tilestream.kernels.nearest import REACH, group_by_cell, nearest_mean_sums
 from tilestream.kernels.neighbours import cells_around
 

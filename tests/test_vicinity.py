@@ -23,8 +23,7 @@ from tilestream.factors.vicinity import (
     vicinity_sums,
 )
 from tilestream.kernels import azimuth
-from tilestream.kernels.cells import cell_sums
-from tilestream.kernels.depth_image import thin
+from tilestream.kernels.thinning import thinned
 from tilestream.sensor import HDL64, OS1_128, VLP16, Sensor
 
 Floats = NDArray[np.float64]
@@ -230,10 +229,11 @@ def test_azimuths_on_edges_fall_in_the_bin_that_begins_there() -> None:
 @pytest.mark.interpreted
 def test_points_are_thinned_to_whole_millimetres_half_to_even() -> None:
     points = np.random.default_rng(7).integers(-3000, 3000, (4000, 3))
-    ours = thin(*cell_sums(points, 500), 500)
+    voxels, ours = thinned(points, 500)
     assert np.array_equal(ours, thinned_mm(points, 500))
+    assert np.array_equal(voxels, np.unique(points // 500, axis=0))
     two = np.array([[1, 3, -2], [2, 4, -1]])
-    assert thin(*cell_sums(two, 500), 500).tolist() == [[2, 4, -2]]
+    assert thinned(two, 500)[1].tolist() == [[2, 4, -2]]
 
 
 def test_rows_of_the_depth_image_lie_halfway_between_beams() -> None:

@@ -30,9 +30,8 @@ from tilestream.factors.virtual_scan import (
 from tilestream.factors.worlds import Dice
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.grid import Box
-from tilestream.kernels.cells import cell_sums
-from tilestream.kernels.depth_image import thin
 from tilestream.kernels.surfels import NORMAL_ONE, surfels_of
+from tilestream.kernels.thinning import thinned
 from tilestream.kernels.virtual_scan import cast
 from tilestream.marks import Mark
 from tilestream.settings import VirtualSettings
@@ -52,9 +51,9 @@ CLEAN = VirtualSettings(fading=0.0, grazing_deg=89.9)
 
 def surfels_from(points: Floats) -> Surfels:
     """The surfels of points [m]."""
-    index, sums = cell_sums(np.rint(points * 1000).astype(np.int64), EDGE)
+    index, centroids = thinned(np.rint(points * 1000).astype(np.int64), EDGE)
     own = np.ones(len(index), np.bool_)
-    made = surfels_of(thin(index, sums, EDGE), index, EDGE, own)
+    made = surfels_of(centroids, index, EDGE, own)
     return Surfels(*made, np.zeros(len(index), np.bool_))
 
 
@@ -405,28 +404,34 @@ def test_a_plane_gives_discs_on_it_and_single_points_balls() -> None:
     assert found.radius_mm.max() <= 200
 
 
-@pytest.mark.interpreted
-def test_the_points_that_decide_a_surfel_are_those_within_its_reach() -> None:
-    rng = np.random.default_rng(7)
-    points = rng.integers(-900, 900, (150, 3))
-    index, sums = cell_sums(points, EDGE)
-    points = thin(index, sums, EDGE)
+@pytest.mark.parametrize(
+    ("edge", "count"),
+    [
+        pytest.param(EDGE, 150, marks=pytest.mark.interpreted, id="loose"),
+        pytest.param(EDGE, 20_000, id="a voxel full beside the other"),
+        pytest.param(4000, 150, id="sums of more than 32 bits"),
+    ],
+)
+def test_the_points_that_decide_a_surfel_are_those_within_its_reach(edge: int, count: int) -> None:
+    rng, scale = np.random.default_rng(7), edge / 200
+    points = rng.integers(-5 * edge, 5 * edge, (count, 3)) + np.array([10**9, -(10**9), 0])
+    index, points = thinned(points, edge)
     own = np.arange(len(points)) % 3 != 0
-    centre, normal, radius = surfels_of(points, index, EDGE, own)
+    centre, normal, radius = surfels_of(points, index, edge, own)
     for row, at in zip(np.flatnonzero(own), range(own.sum()), strict=True):
-        near = points[((points - points[row]) ** 2).sum(axis=1) <= 450**2]
+        near = points[((points - points[row]) ** 2).sum(axis=1) <= (450 * scale) ** 2]
         flat = False
         if len(near) >= 5:
             values, vectors = np.linalg.eigh(np.cov(near.T.astype(np.float64)))
             s3, s2 = np.sqrt(np.maximum(values[:2], 0.0))
-            flat = s3 < 100.0 and s3 < 0.6 * s2
+            flat = s3 < 100.0 * scale and s3 < 0.6 * s2
         assert normal[at].any() == flat
         if flat:
             unit = vectors[:, 0]
             onto = points[row] + unit * (unit @ (near.mean(axis=0) - points[row]))
             np.testing.assert_allclose(centre[at], onto, atol=0.51)
             assert abs(normal[at] @ unit) / NORMAL_ONE > 1.0 - 1e-4
-            assert abs(radius[at] - min(200.0, 50.0 + 0.6 * s2)) <= 0.51
+            assert abs(radius[at] - min(200.0 * scale, 50.0 * scale + 0.6 * s2)) <= 0.51
         else:
             np.testing.assert_array_equal(centre[at], points[row])
 

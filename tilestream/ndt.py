@@ -1,42 +1,18 @@
 """Points to cells: the normal distribution map (definitions, section 1)."""
 
+from typing import Any
+
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from tilestream.errors import UsageError
 from tilestream.grid import MM_PER_M, whole_mm
-from tilestream.kernels.cells import EXACT_MM, cell_sums, moments
-from tilestream.kernels.scatter import round_to_mm
-from tilestream.records import Cells, Int64
+from tilestream.kernels.bounds import bounds
+from tilestream.kernels.cells import EXACT_MM, cell_sums_in, moments
+from tilestream.records import Cells, Float64, Int64
 
 MIN_POINTS = 6
 """Least number of map points of a cell."""
-_LIMITS_MM = np.full(3, EXACT_MM - 1.0)
-
-
-def to_mm(points: ArrayLike) -> Int64:
-    """Points [m] as whole millimetres, rounded half to even: what the tile store holds.
-
-    Args:
-        points: (n, 3) points [m, map frame].
-
-    Raises:
-        UsageError: another shape, values that are not finite numbers, or farther than 10^9 km out.
-    """
-    try:
-        metres = np.asarray(points)
-    except ValueError:
-        raise UsageError("points are no array: give an (n, 3) array of metres") from None
-    if metres.dtype.kind not in "iuf":
-        raise UsageError(f"points have type {metres.dtype}: give an (n, 3) array of metres")
-    if metres.ndim != 2 or metres.shape[1] != 3:
-        raise UsageError(f"points have shape {metres.shape}: give an (n, 3) array of metres")
-    metres = np.ascontiguousarray(metres, np.float64)
-    mm = np.empty(metres.shape, np.int64)
-    row = round_to_mm(metres, _LIMITS_MM, mm)
-    if row >= 0:
-        raise UsageError(f"point {row} is {tuple(metres[row].tolist())}: give finite metres")
-    return mm
 
 
 def cells_of_mm(points_mm: Int64, cell_mm: int, min_points: int = MIN_POINTS) -> Cells:
@@ -49,19 +25,51 @@ def cells_of_mm(points_mm: Int64, cell_mm: int, min_points: int = MIN_POINTS) ->
 
     Raises:
         UsageError: the cell size is not positive or too large for this many points, `min_points`
-            is below 2 (a covariance needs two).
+            is below 2 (a covariance needs two), or a point is farther than 10^9 km out.
     """
+    return _cells(np.ascontiguousarray(points_mm), 1, cell_mm, min_points)
+
+
+def _cells(points: NDArray[Any], unit_mm: int, cell_mm: int, min_points: int) -> Cells:
+    """The cells of points [`unit_mm` mm]."""
     if cell_mm <= 0:
         raise UsageError(f"cell_size is {cell_mm / MM_PER_M:g} m: give more than 0")
-    if max(len(points_mm), 1) * cell_mm**2 >= 2**62:
+    if max(len(points), 1) * cell_mm**2 >= 2**62:
         raise UsageError(
-            f"cell_size is {cell_mm / MM_PER_M:g} m: too large for {len(points_mm)} points"
+            f"cell_size is {cell_mm / MM_PER_M:g} m: too large for {len(points)} points"
         )
     if min_points < 2:
         raise UsageError(f"min_points is {min_points}: a covariance needs at least 2")
-    index, sums = cell_sums(points_mm, cell_mm, min_points)
+    box = bounds(points)
+    if not _in_reach(box, unit_mm).all():
+        row = int(np.argmin(_in_reach(points, unit_mm).all(axis=1)))
+        raise UsageError(f"point {row} is {tuple(points[row].tolist())}: give finite metres")
+    index, sums = cell_sums_in(box, points, unit_mm, cell_mm, min_points)
     mean, covariance = moments(index, sums, cell_mm)
     return Cells(index, sums[:, 0].copy(), mean, covariance, cell_mm / MM_PER_M)
+
+
+def _in_reach(points: NDArray[Any], unit_mm: int) -> NDArray[np.bool_]:
+    """Which coordinates [`unit_mm` mm] have an exact voxel index."""
+    near: NDArray[np.bool_] = np.abs(np.rint(points * unit_mm)) < EXACT_MM
+    return near
+
+
+def _metres(points: ArrayLike) -> Float64:
+    """Points as an array of metres.
+
+    Raises:
+        UsageError: another shape, or no numbers.
+    """
+    try:
+        metres = np.asarray(points)
+    except ValueError:
+        raise UsageError("points are no array: give an (n, 3) array of metres") from None
+    if metres.dtype.kind not in "iuf":
+        raise UsageError(f"points have type {metres.dtype}: give an (n, 3) array of metres")
+    if metres.ndim != 2 or metres.shape[1] != 3:
+        raise UsageError(f"points have shape {metres.shape}: give an (n, 3) array of metres")
+    return np.ascontiguousarray(metres, np.float64)
 
 
 def cells_of(points: ArrayLike, cell_size: float = 2.0, min_points: int = MIN_POINTS) -> Cells:
@@ -88,4 +96,4 @@ def cells_of(points: ArrayLike, cell_size: float = 2.0, min_points: int = MIN_PO
         >>> len(cells), cells.index[0].tolist(), cells.count[0].item()
         (1, [0, 0, 0], 50)
     """
-    return cells_of_mm(to_mm(points), whole_mm(cell_size, "cell_size"), min_points)
+    return _cells(_metres(points), MM_PER_M, whole_mm(cell_size, "cell_size"), min_points)

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from tilestream.errors import UsageError
 from tilestream.grid import MM_PER_M, whole_mm
 from tilestream.kernels import cells as kernels
+from tilestream.kernels.eigen import eigen
 from tilestream.notebook import draw_cells, draw_line, html_of
 
 Float64 = NDArray[np.float64]
@@ -186,7 +187,7 @@ class Cells:
 
     @cached_property
     def _eigen(self) -> tuple[Float64, Float64]:
-        return kernels.eigen(self.covariance)
+        return eigen(self.covariance)
 
     @cached_property
     def _regularised(self) -> tuple[Float64, Float64]:

@@ -162,7 +162,7 @@ class IngestSettings(Settings):
     """Edge of a tile [m], whole millimetres, a multiple of every cell size that will be used."""
     halo: float = 10.0
     """What tasks read around a tile [m]; 10 m is the reach of the terms of 2 m cells."""
-    map_leaf: Annotated[float, Field(ge=0.0)] = 0.2
+    map_leaf: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.2
     """Edge of the voxels that the map is thinned to, one centroid each [m]; 0 keeps all points."""
     crs: str | None = None
     """CRS of the map, any string that pyproj reads; not given: that of the sources."""

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from tilestream.factors.ghosts import REACH_EDGES as GHOST_EDGES
 from tilestream.factors.ghosts import ghosts_among
 from tilestream.grid import MM_PER_M, Box, TileKey, whole_mm
-from tilestream.kernels.cells import cell_of_points, cell_sums
-from tilestream.kernels.depth_image import thin
+from tilestream.kernels.cells import cell_of_points
 from tilestream.kernels.surfels import NORMAL_ONE, surfels_of
+from tilestream.kernels.thinning import thinned
 from tilestream.records import Float64, Int64
 from tilestream.store import Tile, TileStore, TileTable
 
@@ -63,7 +63,8 @@ class Surfels:
     @cached_property
     def flat(self) -> NDArray[np.bool_]:
         """(n,) whether it is a disc."""
-        return np.asarray(self.normal.any(axis=1))
+        x, y, z = self.normal.T  # each by itself: `any` along rows of three takes ten times as long
+        return np.asarray((x | y | z) != 0)
 
 
 def surfel_mm(store: TileStore) -> int:
@@ -94,9 +95,8 @@ def tile_surfels(store: TileStore, key: TileKey) -> Surfels:
     edge, core = surfel_mm(store), store.grid.core(key)
     store.tile(key)  # which must be there, unlike its neighbours
     points = store.points_in(core.grown(REACH_EDGES * edge))
-    index, sums = cell_sums(points, edge)
+    index, centroids = thinned(points, edge)
     made = core.grown(FINE_EDGES * edge).holds(index * edge)
-    centroids = thin(index, sums, edge)
     fine = _of_voxels(centroids, index, edge, made)
     fine = replace(fine, ghost=ghosts_among(fine.centre_mm, edge))
     voxels, real = index[made], ~fine.ghost
@@ -125,10 +125,10 @@ def _coarse(points: Int64, discs: Int64, edge: int, box: Box) -> tuple[Surfels, 
         edge: edge of the first level's voxels [mm].
         box: where.
     """
-    index, sums = cell_sums(points, COARSE * edge)
+    index, centroids = thinned(points, COARSE * edge)
     made = box.holds(index * COARSE * edge)
-    found = _of_voxels(thin(index, sums, COARSE * edge), index, COARSE * edge, made, touching=True)
-    taken, _ = cell_sums(discs, COARSE)
+    found = _of_voxels(centroids, index, COARSE * edge, made, touching=True)
+    taken, _ = thinned(discs, COARSE)
     bare = cell_of_points(index[made], 1, taken) < 0
     kept = np.logical_and(found.flat, bare)
     return found.where(kept), index[made][kept]

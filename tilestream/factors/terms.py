@@ -12,7 +12,7 @@ from tilestream.factors.catalogue import CRITERIA
 from tilestream.factors.vicinity import Terms, TileTerms
 from tilestream.grid import MM_PER_M, Box, TileKey, whole_mm
 from tilestream.kernels.cells import cell_of_points, cell_sums, moments
-from tilestream.kernels.depth_image import thin
+from tilestream.kernels.thinning import thinned
 from tilestream.ndt import MIN_POINTS
 from tilestream.records import Cells, Int64
 from tilestream.store import POINTS, Tile, TileStore, TileTable, cells_table
@@ -74,7 +74,7 @@ def terms_of(cells: Cells, points_mm: Int64, core: Box, depth_mm: Int64 | None =
     loose = sums[:, 0] < MIN_POINTS
     loose_mean, _ = moments(voxels[loose], sums[loose], cells.cell_mm)
     if depth_mm is None:
-        depth_mm = thin(*cell_sums(points_mm, DEPTH_MM), DEPTH_MM)
+        _, depth_mm = thinned(points_mm, DEPTH_MM)
     return TileTerms.of(
         mean=cells.mean[own],
         terms={name: term[own] for name, term in terms.items()},
@@ -116,9 +116,8 @@ def _depth_points(store: TileStore, key: TileKey) -> Int64:
     parts = [store.tile(near).points_mm() for near in there]
     points = np.concatenate(parts)
     tile_of_point = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    voxels, sums = cell_sums(points, DEPTH_MM)
+    voxels, centroids = thinned(points, DEPTH_MM)
     first = np.full(len(voxels), len(parts))
     np.minimum.at(first, cell_of_points(points, DEPTH_MM, voxels), tile_of_point)
-    own = first == there.index(key)
-    thinned: Int64 = thin(voxels[own], sums[own], DEPTH_MM)
-    return thinned
+    kept: Int64 = centroids[first == there.index(key)]
+    return kept

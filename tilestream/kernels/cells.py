@@ -1,12 +1,15 @@
-"""Normal distributions from points: exact integer sums per voxel, moments, eigenvectors.
+"""Normal distributions from points: exact integer sums per voxel, moments, normals.
 
 Everything up to the covariance is integers, so it depends neither on the order of the points nor
 on the tiling (definitions, section 1). Lengths are millimetres in the sums and metres after them.
 """
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
+from tilestream.kernels.bounds import bounds
 from tilestream.kernels.cache import njit
 
 Float64 = NDArray[np.float64]
@@ -15,6 +18,8 @@ Int64 = NDArray[np.int64]
 EXACT_MM = 2**50
 """Coordinates below this [mm] have an exact voxel index (`voxel_of`)."""
 
+STEP = 2048
+"""Points that are summed at a time: what is known of them stays in the fastest cache."""
 COUNT, SX, SY, SZ, SXX, SXY, SXZ, SYY, SYZ, SZZ = range(10)
 """Columns of the sums of a voxel: 1, x, x x^T over its points [1, mm, mm^2]."""
 
@@ -29,55 +34,47 @@ def voxel_of(x_mm, inverse_edge):  # type: ignore[no-untyped-def]
     return np.int64(np.floor((x_mm + 0.5) * inverse_edge))
 
 
-@njit(nogil=True, boundscheck=False)
-def _bounds(points_mm):  # type: ignore[no-untyped-def]
-    """Lowest and highest coordinates, one row each."""
-    x_lo, y_lo, z_lo = points_mm[0, 0], points_mm[0, 1], points_mm[0, 2]
-    x_hi, y_hi, z_hi = x_lo, y_lo, z_lo
-    for i in range(points_mm.shape[0]):
-        x, y, z = points_mm[i, 0], points_mm[i, 1], points_mm[i, 2]
-        x_lo, y_lo, z_lo = min(x_lo, x), min(y_lo, y), min(z_lo, z)
-        x_hi, y_hi, z_hi = max(x_hi, x), max(y_hi, y), max(z_hi, z)
-    return np.array([[x_lo, y_lo, z_lo], [x_hi, y_hi, z_hi]])
+@njit(nogil=True, error_model="numpy", boundscheck=False)
+def _locate(numbers, unit_mm, edge_mm, low, span, start, voxel, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """The voxels of as many points as `voxel` is long, from the point `start`: the number of each
+    in the box, and the point's offset from its lower corner [mm].
+
+    All in float64, where whole numbers below 2^53 are exact (see `voxel_of`); with unsigned
+    indices, none of which counts from the end: so it runs on vectors.
+    """
+    inverse, edge = 1.0 / edge_mm, np.float64(edge_mm)
+    lx, ly, lz = np.float64(low[0]), np.float64(low[1]), np.float64(low[2])
+    ny, nz = np.float64(span[1]), np.float64(span[2])
+    for i in range(np.uint64(voxel.size)):
+        j = np.uint64(3) * (np.uint64(start) + np.uint64(i))
+        x = np.rint(numbers[j] * unit_mm)
+        y = np.rint(numbers[j + np.uint64(1)] * unit_mm)
+        z = np.rint(numbers[j + np.uint64(2)] * unit_mm)
+        vx, vy = np.floor((x + 0.5) * inverse), np.floor((y + 0.5) * inverse)
+        vz = np.floor((z + 0.5) * inverse)
+        dx[i], dy[i], dz[i] = x - vx * edge, y - vy * edge, z - vz * edge
+        voxel[i] = np.int32(((vx - lx) * ny + (vy - ly)) * nz + (vz - lz))
 
 
 @njit(nogil=True, error_model="numpy", boundscheck=False)
-def _number_voxels(points_mm, edge_mm, low, span, table):  # type: ignore[no-untyped-def]
-    """Give every occupied voxel of the box a row 0, 1, ... in `table`; returns the row of each
-    point and the number of rows.
-    """
-    inverse = 1.0 / edge_mm
-    lx, ly, lz, ny, nz = low[0], low[1], low[2], span[1], span[2]
-    row_of_point = np.empty(points_mm.shape[0], np.int32)
-    used = np.int32(0)
-    for i in range(points_mm.shape[0]):
-        jx = voxel_of(points_mm[i, 0], inverse) - lx
-        jy = voxel_of(points_mm[i, 1], inverse) - ly
-        jz = voxel_of(points_mm[i, 2], inverse) - lz
-        v = np.uint64((jx * ny + jy) * nz + jz)
-        row = table[v]
+def _number(voxel, table, used):  # type: ignore[no-untyped-def]
+    """Turn voxels into rows: new ones get the next, from `used`; returns the rows in use."""
+    for i in range(np.uint64(voxel.size)):
+        row = table[voxel[i]]
         if row < 0:
             row = used
-            table[v] = row
+            table[voxel[i]] = row
             used += np.int32(1)
-        row_of_point[i] = row
-    return row_of_point, np.int64(used)
+        voxel[i] = row
+    return used
 
 
 @njit(nogil=True, error_model="numpy", boundscheck=False)
-def _sum_voxels(points_mm, edge_mm, row_of_point, used):  # type: ignore[no-untyped-def]
-    """Sums of the numbered voxels; rows are two cache lines wide, of which ten columns are used.
-
-    A loop of its own, so that adding to a row does not wait for the next point's row.
-    """
-    inverse = 1.0 / edge_mm
-    rows = np.zeros((used, 16), np.int64)
-    for i in range(points_mm.shape[0]):
-        px, py, pz = points_mm[i, 0], points_mm[i, 1], points_mm[i, 2]
-        x = px - voxel_of(px, inverse) * edge_mm
-        y = py - voxel_of(py, inverse) * edge_mm
-        z = pz - voxel_of(pz, inverse) * edge_mm
-        r = np.uint64(row_of_point[i])
+def _add(row, dx, dy, dz, rows):  # type: ignore[no-untyped-def]
+    """Add points to the sums of their rows."""
+    for i in range(np.uint64(row.size)):
+        x, y, z = np.int64(dx[i]), np.int64(dy[i]), np.int64(dz[i])
+        r = np.uint64(row[i])
         rows[r, COUNT] += 1
         rows[r, SX] += x
         rows[r, SY] += y
@@ -88,7 +85,30 @@ def _sum_voxels(points_mm, edge_mm, row_of_point, used):  # type: ignore[no-unty
         rows[r, SYY] += y * y
         rows[r, SYZ] += y * z
         rows[r, SZZ] += z * z
-    return rows
+
+
+@njit(nogil=True, error_model="numpy", boundscheck=False)
+def _sum_voxels(points, unit_mm, edge_mm, low, span, table):  # type: ignore[no-untyped-def]
+    """Give every occupied voxel of the box a row 0, 1, ... in `table`; returns their sums. Rows are
+    two cache lines wide, of which ten columns are used.
+
+    Step by step, and each step in loops of its own: what is between them stays in the cache, and
+    adding to a row does not wait for the next point's row.
+    """
+    numbers = points.reshape(-1)
+    rows, used = np.zeros((STEP, 16), np.int64), np.int32(0)
+    voxel, offset = np.empty(STEP, np.int32), np.empty((3, STEP))
+    for start in range(0, points.shape[0], STEP):
+        n = min(STEP, points.shape[0] - start)
+        row, dx, dy, dz = voxel[:n], offset[0, :n], offset[1, :n], offset[2, :n]
+        _locate(numbers, unit_mm, edge_mm, low, span, start, row, dx, dy, dz)
+        used = _number(row, table, used)
+        if used > len(rows) - STEP:
+            wider = np.zeros((2 * len(rows), 16), np.int64)
+            wider[: len(rows)] = rows
+            rows = wider
+        _add(row, dx, dy, dz, rows)
+    return rows[:used]
 
 
 @njit(nogil=True)
@@ -137,22 +157,33 @@ def cell_sums(points_mm: Int64, edge_mm: int, min_points: int = 1) -> tuple[Int6
         (k, 3) voxel indices, lexicographic, and (k, 10) sums [1, mm, mm^2] in the columns `COUNT`
         to `SZZ`.
     """
-    if not len(points_mm):
-        return np.zeros((0, 3), np.int64), np.zeros((0, 10), np.int64)
-    points_mm = np.ascontiguousarray(points_mm, np.int64)
-    bounds = _bounds(points_mm) // edge_mm
-    low, span = bounds[0], bounds[1] - bounds[0] + 1
-    cut = _cut(low, span, len(points_mm))
+    points_mm = np.ascontiguousarray(points_mm)
+    return cell_sums_in(bounds(points_mm), points_mm, 1, edge_mm, min_points)
+
+
+def cell_sums_in(
+    box: NDArray[Any], points: NDArray[Any], unit_mm: int, edge_mm: int, min_points: int
+) -> tuple[Int64, Int64]:
+    """As `cell_sums`, of points whose `bounds` are known.
+
+    They are in units of `unit_mm` (1: whole millimetres, 1000: metres); the whole millimetres, half
+    to even, are meant.
+    """
+    low, high = np.rint(box * unit_mm).astype(np.int64) // edge_mm
+    span = high - low + 1
+    cut = _cut(low, span, len(points))
     if cut is not None:
         axis, voxel = cut
-        below = points_mm[:, axis] < voxel * edge_mm
-        halves = [cell_sums(points_mm[half], edge_mm, min_points) for half in (below, ~below)]
+        below = np.rint(points[:, axis] * unit_mm) < voxel * edge_mm
+        halves = [
+            cell_sums_in(bounds(half), half, unit_mm, edge_mm, min_points)
+            for half in (points[below], points[~below])
+        ]
         index, sums = (np.concatenate(parts) for parts in zip(*halves, strict=True))
         order = lexicographic_order(index)
         return index[order], sums[order]
     table = np.full(int(np.prod(span)), -1, np.int32)
-    row_of_point, used = _number_voxels(points_mm, edge_mm, low, span, table)
-    rows = _sum_voxels(points_mm, edge_mm, row_of_point, used)
+    rows = _sum_voxels(points, float(unit_mm), edge_mm, low, span, table)
     found: tuple[Int64, Int64] = _in_order(rows, low, span, table, min_points)
     return found
 
@@ -205,85 +236,6 @@ def moments(index: Int64, sums: Int64, edge_mm: int) -> tuple[Float64, Float64]:
         covariance[i, 0, 2] = covariance[i, 2, 0] = _covariance_mm2(n, sx, sz, sxz, exact) * 1e-6
         covariance[i, 1, 2] = covariance[i, 2, 1] = _covariance_mm2(n, sy, sz, syz, exact) * 1e-6
     return mean, covariance
-
-
-@njit(nogil=True, error_model="numpy", inline="always")
-def _rotated(app, aqq, apq, arp, arq, v0p, v0q, v1p, v1q, v2p, v2q):  # type: ignore[no-untyped-def]
-    """One Jacobi rotation in the plane (p, q) that makes a_pq zero; r is the third axis."""
-    if apq == 0.0:
-        return app, aqq, arp, arq, v0p, v0q, v1p, v1q, v2p, v2q
-    theta = (aqq - app) / (2.0 * apq)
-    t = 1.0 / (abs(theta) + np.sqrt(theta * theta + 1.0))
-    if theta < 0.0:
-        t = -t
-    c = 1.0 / np.sqrt(t * t + 1.0)
-    s = t * c
-    return (
-        app - t * apq,
-        aqq + t * apq,
-        c * arp - s * arq,
-        s * arp + c * arq,
-        c * v0p - s * v0q,
-        s * v0p + c * v0q,
-        c * v1p - s * v1q,
-        s * v1p + c * v1q,
-        c * v2p - s * v2q,
-        s * v2p + c * v2q,
-    )
-
-
-@njit(nogil=True, error_model="numpy")
-def eigen(covariance: Float64) -> tuple[Float64, Float64]:
-    """Eigenvalues and eigenvectors of symmetric 3x3 matrices by cyclic Jacobi rotations.
-
-    Each rotation makes one off-diagonal entry zero; a few sweeps over the three leave less than
-    1e-20 of the diagonal (the closed form by trigonometry loses 2e-9 of lam1 on poles, this 5e-16).
-
-    Args:
-        covariance: (n, 3, 3) symmetric matrices, any unit.
-
-    Returns:
-        (n, 3) eigenvalues, descending, those below 0 set to 0, and (n, 3, 3) unit eigenvectors in
-        the columns: eigenvectors[i, :, 0] belongs to the largest.
-    """
-    k = covariance.shape[0]
-    values = np.empty((k, 3))
-    vectors = np.empty((k, 3, 3))
-    for i in range(k):
-        a, b, c = covariance[i, 0, 0], covariance[i, 1, 1], covariance[i, 2, 2]
-        ab, ac, bc = covariance[i, 0, 1], covariance[i, 0, 2], covariance[i, 1, 2]
-        v0a, v0b, v0c = 1.0, 0.0, 0.0
-        v1a, v1b, v1c = 0.0, 1.0, 0.0
-        v2a, v2b, v2c = 0.0, 0.0, 1.0
-        for _ in range(20):
-            if abs(ab) + abs(ac) + abs(bc) <= 1e-20 * (abs(a) + abs(b) + abs(c)):
-                break
-            a, b, ac, bc, v0a, v0b, v1a, v1b, v2a, v2b = _rotated(
-                a, b, ab, ac, bc, v0a, v0b, v1a, v1b, v2a, v2b
-            )
-            ab = 0.0
-            a, c, ab, bc, v0a, v0c, v1a, v1c, v2a, v2c = _rotated(
-                a, c, ac, ab, bc, v0a, v0c, v1a, v1c, v2a, v2c
-            )
-            ac = 0.0
-            b, c, ab, ac, v0b, v0c, v1b, v1c, v2b, v2c = _rotated(
-                b, c, bc, ab, ac, v0b, v0c, v1b, v1c, v2b, v2c
-            )
-            bc = 0.0
-        if a < b:
-            a, b = b, a
-            v0a, v0b, v1a, v1b, v2a, v2b = v0b, v0a, v1b, v1a, v2b, v2a
-        if b < c:
-            b, c = c, b
-            v0b, v0c, v1b, v1c, v2b, v2c = v0c, v0b, v1c, v1b, v2c, v2b
-        if a < b:
-            a, b = b, a
-            v0a, v0b, v1a, v1b, v2a, v2b = v0b, v0a, v1b, v1a, v2b, v2a
-        values[i, 0], values[i, 1], values[i, 2] = max(a, 0.0), max(b, 0.0), max(c, 0.0)
-        vectors[i, 0, 0], vectors[i, 0, 1], vectors[i, 0, 2] = v0a, v0b, v0c
-        vectors[i, 1, 0], vectors[i, 1, 1], vectors[i, 1, 2] = v1a, v1b, v1c
-        vectors[i, 2, 0], vectors[i, 2, 1], vectors[i, 2, 2] = v2a, v2b, v2c
-    return values, vectors
 
 
 @njit(nogil=True, error_model="numpy")
@@ -360,9 +312,9 @@ def cell_of_points(points_mm: Int64, edge_mm: int, index: Int64) -> Int64:
     """
     if not len(index):
         return np.full(len(points_mm), -1, np.int64)
-    low = index.min(axis=0)
-    span = index.max(axis=0) - low + 1
-    cut = _cut(low, span, len(points_mm) + len(index))
+    low, high = bounds(np.ascontiguousarray(index))
+    span = high - low + 1
+    cut = _cut(low, span, 4 * (len(points_mm) + len(index)))
     if cut is not None:
         axis, voxel = cut
         out = np.empty(len(points_mm), np.int64)

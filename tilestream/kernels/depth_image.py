@@ -18,31 +18,6 @@ MARGIN = 1e-6
 
 
 @njit(nogil=True)
-def thin(index: NDArray[np.int64], sums: NDArray[np.int64], edge_mm: int) -> NDArray[np.int64]:
-    """Centroids of voxels, integer sum / count, rounded to whole millimetres, half to even.
-
-    Args:
-        index: (n, 3) voxel indices.
-        sums: (n, 4 or more) count and sums of the offsets from the voxel's corner [1, mm].
-        edge_mm: edge of a voxel [mm].
-
-    Returns:
-        (n, 3) points [mm].
-    """
-    out = np.empty(index.shape, np.int64)
-    for i in range(len(index)):
-        count = sums[i, 0]
-        for a in range(3):
-            total = sums[i, 1 + a]
-            whole = total // count
-            twice = 2 * (total - whole * count)
-            # The parity that decides a tie is that of the coordinate, not of the offset.
-            at = index[i, a] * edge_mm + whole
-            out[i, a] = at + (twice > count or (twice == count and at % 2 == 1))
-    return out
-
-
-@njit(nogil=True)
 def row_guesses(edges: NDArray[np.float64]) -> NDArray[np.int32]:
     """A look-up table: the row at the beginning of each of many equal steps from the lowest to the
     highest edge.

@@ -7,29 +7,10 @@ import numpy as np
 
 from tilestream.kernels.cache import njit
 
+STEP = 2048
+"""Points that are located at a time."""
 SPLITMIX = np.uint64(0x9E3779B97F4A7C15)
 """2^64 / golden ratio, the increment of the splitmix64 generator (Steele et al. 2014)."""
-
-
-@njit(nogil=True, error_model="numpy")
-def round_to_mm(points, limits_mm, out):  # type: ignore[no-untyped-def]
-    """Coordinates in metres to whole millimetres, half to even.
-
-    Args:
-        points: (n, 3) float64 [m].
-        limits_mm: (3,) float64, largest magnitude per axis [mm].
-        out: (n, 3) int64, receives the millimetres.
-
-    Returns:
-        The row of the first point beyond the limits, or -1.
-    """
-    for i in range(points.shape[0]):
-        for axis in range(3):
-            mm = np.rint(points[i, axis] * 1000.0)
-            if not abs(mm) <= limits_mm[axis]:
-                return i
-            out[i, axis] = np.int64(mm)
-    return -1
 
 
 @njit(nogil=True, inline="always")
@@ -47,87 +28,102 @@ def point_hash(x, y, z):  # type: ignore[no-untyped-def]
     return mix(key * SPLITMIX + np.uint64(z))
 
 
-@njit(nogil=True, error_model="numpy")
-def tile_bounds(points_mm, tile_mm):  # type: ignore[no-untyped-def]
-    """The lowest and highest tile index of the points, as (ix_lo, iy_lo, ix_hi, iy_hi)."""
-    x_lo = x_hi = points_mm[0, 0]
-    y_lo = y_hi = points_mm[0, 1]
-    for i in range(1, points_mm.shape[0]):
-        x, y = points_mm[i, 0], points_mm[i, 1]
-        x_lo, x_hi = min(x_lo, x), max(x_hi, x)
-        y_lo, y_hi = min(y_lo, y), max(y_hi, y)
-    return x_lo // tile_mm, y_lo // tile_mm, x_hi // tile_mm, y_hi // tile_mm
+@njit(nogil=True, error_model="numpy", boundscheck=False)
+def _locate(numbers, start, tile_mm, window, tile_of, in_x, in_y, in_z):  # type: ignore[no-untyped-def]
+    """Which tile owns each of as many points as `tile_of` is long, from the point `start`, and
+    where in it they are [mm from its origin].
 
-
-@njit(nogil=True, error_model="numpy")
-def tile_of_points(points_mm, tile_mm, ix_lo, iy_lo, rows, tile_of, counts):  # type: ignore[no-untyped-def]
-    """Which tile of a dense window owns each point, and how many each tile owns.
-
-    Args:
-        points_mm: (n, 3) int64 [mm].
-        tile_mm: edge of a tile [mm].
-        ix_lo: lowest tile index in x of the window.
-        iy_lo: lowest tile index in y of the window.
-        rows: tiles of the window in y.
-        tile_of: (n,) int32, receives the number of the tile: (ix - ix_lo) * rows + iy - iy_lo.
-        counts: (tiles of the window,) int64, the points of each tile are added.
+    In float64, where whole numbers below 2^53 are exact, as in `voxel_of`; with unsigned indices,
+    none of which counts from the end: so it runs on vectors.
     """
-    # the floor of a float64 quotient of whole numbers is exact below 2^52, and far faster
-    for i in range(points_mm.shape[0]):
-        ix = np.int64(np.floor(points_mm[i, 0] / tile_mm))
-        iy = np.int64(np.floor(points_mm[i, 1] / tile_mm))
-        tile_of[i] = (ix - ix_lo) * rows + iy - iy_lo
-    for i in range(points_mm.shape[0]):
-        counts[tile_of[i]] += 1
+    inverse = 1.0 / tile_mm
+    ix_lo, iy_lo, rows = np.float64(window[0]), np.float64(window[1]), np.float64(window[2])
+    for i in range(np.uint64(tile_of.size)):
+        j = np.uint64(3) * (np.uint64(start) + np.uint64(i))
+        x = np.rint(numbers[j] * 1000.0)
+        y = np.rint(numbers[j + np.uint64(1)] * 1000.0)
+        ix, iy = np.floor((x + 0.5) * inverse), np.floor((y + 0.5) * inverse)
+        tile_of[i] = np.int32((ix - ix_lo) * rows + (iy - iy_lo))
+        in_x[i] = np.int32(x - ix * tile_mm)
+        in_y[i] = np.int32(y - iy * tile_mm)
+        in_z[i] = np.int32(np.rint(numbers[j + np.uint64(2)] * 1000.0))
 
 
-@njit(nogil=True, error_model="numpy")
-def group_by_tile(points_mm, tile_of, tile_mm, ix_lo, iy_lo, rows, next_row, out, prints):  # type: ignore[no-untyped-def]
-    """Copy the points tile by tile, relative to their tile's origin, and add up each tile's
-    fingerprint.
+@njit(nogil=True, error_model="numpy", boundscheck=False)
+def group_by_tile(points, tile_mm, window, counts, out):  # type: ignore[no-untyped-def]
+    """Points as whole millimetres, half to even, tile by tile; those of a tile in their order.
 
-    The fingerprint of a set of points is two sums, modulo 2^64, each of a different 64-bit hash of
-    every point: the same for any order and any split into blocks.
+    Twice over the points, in steps that stay in the fastest cache: how many each tile owns, then
+    where each goes.
 
     Args:
-        points_mm: (n, 3) int64 [mm].
-        tile_of: (n,) int32 number of each point's tile in the window.
+        points: (n, 3) float64 [m], contiguous; in the window once they are whole millimetres.
         tile_mm: edge of a tile [mm].
-        ix_lo: lowest tile index in x of the window.
-        iy_lo: lowest tile index in y of the window.
-        rows: tiles of the window in y.
-        next_row: (tiles,) int64, first row of each tile in `out`; is advanced.
+        window: (3,) int64, lowest tile index in x and in y, and tiles in y. A tile has the number
+            (ix - lowest) * rows + iy - lowest.
+        counts: (tiles of the window,) int64 zeros, receives the points of each tile.
         out: (n, 3) int32, receives the millimetres from the tile's origin.
-        prints: (tiles, 2) uint64, the fingerprints are added.
     """
-    last, x_lo, y_lo = -1, 0, 0
-    for i in range(points_mm.shape[0]):
-        tile = tile_of[i]
-        if tile != last:
-            last = tile
-            x_lo, y_lo = (ix_lo + tile // rows) * tile_mm, (iy_lo + tile % rows) * tile_mm
-        row = next_row[tile]
-        next_row[tile] = row + 1
-        x = points_mm[i, 0] - x_lo
-        y = points_mm[i, 1] - y_lo
-        z = points_mm[i, 2]
-        out[row, 0] = x
-        out[row, 1] = y
-        out[row, 2] = z
-        key = point_hash(x, y, z)
-        prints[tile, 0] += key
-        prints[tile, 1] += mix(key + SPLITMIX)
+    numbers, local, tile_of = (
+        points.reshape(-1),
+        np.empty((3, STEP), np.int32),
+        np.empty(STEP, np.int32),
+    )
+    next_row = np.empty(0, np.int64)
+    for placing in range(2):
+        for start in range(0, points.shape[0], STEP):
+            n = min(STEP, points.shape[0] - start)
+            tiles, x, y, z = tile_of[:n], local[0, :n], local[1, :n], local[2, :n]
+            _locate(numbers, start, tile_mm, window, tiles, x, y, z)
+            if placing:
+                _place(tiles, x, y, z, next_row, out)
+            else:
+                for i in range(np.uint64(n)):
+                    counts[tiles[i]] += 1
+        next_row = np.cumsum(counts) - counts
 
 
-@njit(nogil=True, error_model="numpy")
-def add_print(points, found):  # type: ignore[no-untyped-def]
-    """Add the fingerprint of points to another: as `group_by_tile` makes it.
+@njit(nogil=True, error_model="numpy", boundscheck=False)
+def _place(tile_of, x, y, z, next_row, out):  # type: ignore[no-untyped-def]
+    """Write points to the next rows of their tiles."""
+    for i in range(np.uint64(tile_of.size)):
+        row = next_row[tile_of[i]]
+        next_row[tile_of[i]] = row + 1
+        out[row, 0], out[row, 1], out[row, 2] = x[i], y[i], z[i]
+
+
+@njit(nogil=True, error_model="numpy", boundscheck=False)
+def print_of(numbers):  # type: ignore[no-untyped-def]
+    """The fingerprint of a set of points: two sums, modulo 2^64, each of a different 64-bit hash of
+    every point. It is the same for any order, and that of two sets together is their sum.
+
+    Args:
+        numbers: (3 n,) int32, x, y, z of one point after the other [mm from the tile's origin].
+    """
+    first = second = np.uint64(0)
+    for i in range(np.uint64(numbers.size // 3)):
+        j = np.uint64(3) * np.uint64(i)  # unsigned: no index from the end, which would be a branch
+        x, y, z = numbers[j], numbers[j + np.uint64(1)], numbers[j + np.uint64(2)]
+        key = point_hash(np.int64(x), np.int64(y), np.int64(z))
+        first += key
+        second += mix(key + SPLITMIX)
+    return first, second
+
+
+@njit(nogil=True, error_model="numpy", boundscheck=False)
+def prints_of(points, ends):  # type: ignore[no-untyped-def]
+    """The fingerprints of sets of points that lie one after the other.
 
     Args:
         points: (n, 3) int32 [mm from the tile's origin].
-        found: (2,) uint64, the fingerprint is added.
+        ends: (k,) int64, the row behind each set.
+
+    Returns:
+        (k, 2) uint64, the two sums of each.
     """
-    for i in range(points.shape[0]):
-        key = point_hash(np.int64(points[i, 0]), np.int64(points[i, 1]), np.int64(points[i, 2]))
-        found[0] += key
-        found[1] += mix(key + SPLITMIX)
+    out = np.empty((len(ends), 2), np.uint64)
+    numbers, start = points.reshape(-1), 0
+    for k in range(len(ends)):
+        out[k, 0], out[k, 1] = print_of(numbers[3 * start : 3 * ends[k]])
+        start = ends[k]
+    return out

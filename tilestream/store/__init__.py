@@ -116,8 +116,10 @@ class Tile:
 
     def _core_mm(self) -> Int64:
         xyz = self.read_table(POINTS)["xyz"]
-        origin = np.array(self.store.grid.origin_mm(self.key), dtype=np.int64)
-        return np.ascontiguousarray(xyz.T).astype(np.int64) + origin
+        points = np.empty(xyz.shape[::-1], np.int64)
+        for axis, at in enumerate(self.store.grid.origin_mm(self.key)):
+            np.add(xyz[axis], np.int64(at), out=points[:, axis])
+        return points
 
     def cells(self, cell_size: float = 2.0) -> Cells:
         """The NDT cells of the tile's core, from its table where that is done, else made now.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tilestream.formats.motion import FASTEST, jumped
-from tilestream.kernels.fixed_order import norms, turned
+from tilestream.kernels.fixed_order import moved, norms
 from tilestream.records import Float64, Int64, Trajectory
 
 
@@ -49,7 +49,7 @@ def inverse(T: Float64) -> Float64:
 
 def transform(T: Float64, points: Float64) -> Float64:
     """(n, 3) points moved by one (4, 4) rigid motion; a point comes out the same in any block."""
-    return turned(T[:3, :3], points) + T[:3, 3]
+    return moved(np.ascontiguousarray(T), np.ascontiguousarray(points, np.float64))
 
 
 def trajectory(stamps_ns: Int64, numbers: Float64, frame: str) -> tuple[Trajectory, int]:

@@ -5,17 +5,21 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tilestream.errors import DamagedError
 from tilestream.grid import MM_PER_M, TileGrid, TileKey, whole_mm
-from tilestream.kernels import scatter as kernels
-from tilestream.kernels import thinning
+from tilestream.kernels.thinning import sort, thin
 from tilestream.marks import hash_of
 from tilestream.pipeline.engine.outputs import Made, TileArrays
 from tilestream.pipeline.engine.stage import BASE_BYTES, Counts, Task, stage
-from tilestream.pipeline.stages.scatter import Fragment, Int32, Print, fragments_of
-from tilestream.records import Int64
+from tilestream.pipeline.stages.scatter import (
+    Fragment,
+    Int32,
+    Print,
+    add_prints,
+    fragments_of,
+    prints_of,
+)
 from tilestream.store import POINTS, Share, TileStore
 
 BATCH_POINTS = 500_000
@@ -23,13 +27,11 @@ BATCH_POINTS = 500_000
 BYTES_PER_BATCH_POINT = 40
 """Memory per point of a batch: read, and those of a strip picked."""
 BYTES_PER_STRIP_POINT = 40
-"""Memory per point of a strip: read, ordered, keys of an axis."""
+"""Memory per point of a strip: read, as sorted numbers, ordered."""
 BYTES_PER_STORED_POINT = 32
 """Memory per point of the tile: the strips that are done, the tile, packed."""
 MAX_STRIPS = 64
 """Strips that a tile is at most cut into to merge it within the promised memory."""
-MAX_BINS = 2**22
-"""Widest range of voxels along an axis that is counted as it is."""
 SORT_EDGE_MM = 1000
 """Unthinned points are stored sorted by voxels of this edge, then by x, y, z."""
 
@@ -80,7 +82,7 @@ class Pieces:
             DamagedError: a fragment is not what was written (removed, cut or changed meanwhile).
         """
         folder, point = fragments_of(self.store_url), 3 * np.dtype(np.int32).itemsize
-        found = np.zeros(2, np.uint64)
+        found: Print = (0, 0)
         for piece in self.pieces:
             file = folder.under(f"{piece.fragment}.bin")
             end = piece.start + piece.count
@@ -90,13 +92,13 @@ class Pieces:
                 if len(data) != (stop - start) * point:
                     raise DamagedError(f"{file.root} was cut short: run the same command again")
                 points = np.frombuffer(data, np.int32).reshape(-1, 3)
-                kernels.add_print(points, found)
+                found = add_prints(found, *prints_of(points, np.array([len(points)])))
                 yield points
         self._require_all(found)
 
-    def _require_all(self, found: NDArray[np.uint64]) -> None:
+    def _require_all(self, found: Print) -> None:
         """Refuse points that are not those that were scattered."""
-        if (int(found[0]), int(found[1])) != self.fingerprint:
+        if found != self.fingerprint:
             files = ", ".join(f"{name}.bin" for name in sorted({p.fragment for p in self.pieces}))
             folder = fragments_of(self.store_url).root
             raise DamagedError(f"{folder}: one of {files} is damaged: run the same command again")
@@ -146,7 +148,7 @@ def merge(pieces: Pieces, grid: TileGrid, tile: TileKey, map_leaf: float) -> Mad
         ]
         points = np.concatenate(batches)
         del batches
-        parts.append(thin(points, leaf, origin) if leaf else sort(points))
+        parts.append(thin(points, leaf, origin) if leaf else sort(points, SORT_EDGE_MM))
     xyz = np.concatenate(parts, axis=1) if len(parts) > 1 else parts[0]
     facts = {
         "points": xyz.shape[1],
@@ -193,37 +195,3 @@ def merge_tasks(
             )
         )
     return tasks
-
-
-def thin(points: Int32, leaf: int, origin: Int64) -> Int32:
-    """One point per voxel: (3, m) int32 centroids [mm from the tile's origin], in voxel order."""
-    ordered = by_voxel(points, leaf)
-    out = np.empty_like(ordered)
-    voxels = thinning.centroids(ordered, leaf, origin, out)
-    return np.ascontiguousarray(out[:voxels].T)
-
-
-def sort(points: Int32) -> Int32:
-    """All points, (3, n) int32, by voxels of SORT_EDGE_MM, then x, y, z."""
-    ordered = by_voxel(points, SORT_EDGE_MM)
-    thinning.sort_in_voxels(ordered, SORT_EDGE_MM)
-    return np.ascontiguousarray(ordered.T)
-
-
-def by_voxel(points: Int32, edge: int) -> Int32:
-    """The (n, 3) points ordered by voxel, lexicographically: a counting sort per axis, z first."""
-    for axis in (2, 1, 0):
-        keys = dense(points[:, axis] // np.int32(edge))
-        counts = np.bincount(keys)
-        ordered = np.empty_like(points)
-        thinning.place_rows(points, keys, np.cumsum(counts) - counts, ordered)
-        points = ordered
-    return points
-
-
-def dense(keys: Int32) -> Int64:
-    """The keys from 0, in their order; without gaps where stray points make these too wide."""
-    lowest = int(keys.min(initial=0))
-    if int(keys.max(initial=0)) - lowest > MAX_BINS:
-        return np.unique(keys, return_inverse=True)[1].astype(np.int64)
-    return keys.astype(np.int64) - lowest

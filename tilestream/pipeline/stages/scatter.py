@@ -20,6 +20,7 @@ from tilestream.formats import open_source
 from tilestream.formats.base import Block, SourceInfo, Span
 from tilestream.grid import MAX_XY_MM, MAX_Z_MM, MM_PER_M, TileGrid, TileKey
 from tilestream.kernels import scatter as kernels
+from tilestream.kernels.bounds import bounds
 from tilestream.marks import hash_of, sealed, unsealed
 from tilestream.pipeline.engine.outputs import Facts, Made
 from tilestream.pipeline.engine.plan import Plan
@@ -32,9 +33,13 @@ Print = tuple[int, int]
 """The fingerprint of a set of points: two sums of 64-bit hashes."""
 
 BYTES_PER_BLOCK_POINT = 160
-"""Memory per point of a block: as read, float64, int64, grouped int32."""
-MAX_BLOCK_POINTS = 1_000_000
-"""Points per block beyond which larger blocks gain nothing."""
+"""Memory per point of a block: as read, float64, grouped int32."""
+MAX_BLOCK_POINTS = 2**16
+"""Points per block beyond which larger blocks leave the caches of a core."""
+PIECE_POINTS = 2**20
+"""Points that are held until they are written, tile by tile: short pieces would be slow to read."""
+BYTES_PER_PIECE_POINT = 12
+"""Memory per point of those."""
 MIN_BLOCK_POINTS = 20_000
 """Points per block below which the work per block would be overhead."""
 WINDOW = 2**17
@@ -177,7 +182,8 @@ def fragments_of(store_url: str) -> Files:
 def _written(name: str, groups: Iterable[Grouped], file: Any) -> Fragment:
     pieces: list[tuple[int, int, int, int]] = []
     prints: dict[TileKey, Print] = {}
-    start = dropped = left_out = outside = 0
+    held: dict[TileKey, list[Int32]] = {}
+    start = points = dropped = left_out = outside = 0
     outside_at: tuple[float, ...] = ()
     for group in groups:
         dropped += group.dropped
@@ -185,18 +191,37 @@ def _written(name: str, groups: Iterable[Grouped], file: Any) -> Fragment:
         if len(group.outside) and not outside:
             outside_at = tuple(group.outside[0].tolist())
         outside += len(group.outside)
-        file.write(group.points.tobytes())
+        first = 0
         for key, count, fingerprint in group.tiles:
-            pieces.append((*key, start, count))
+            held.setdefault(key, []).append(group.points[first : first + count])
             prints[key] = add_prints(prints.get(key, (0, 0)), fingerprint)
-            start += count
+            first += count
+        points += first
+        if points - start >= PIECE_POINTS:
+            start = _write_pieces(held, start, pieces, file)
+    _write_pieces(held, start, pieces, file)
     of_tiles = tuple((*key, *fingerprint) for key, fingerprint in prints.items())
-    return Fragment(name, start, dropped, tuple(pieces), of_tiles, left_out, outside, outside_at)
+    return Fragment(name, points, dropped, tuple(pieces), of_tiles, left_out, outside, outside_at)
+
+
+def _write_pieces(
+    held: dict[TileKey, list[Int32]], start: int, pieces: list[tuple[int, int, int, int]], file: Any
+) -> int:
+    """Write what is held, a piece for each tile, and hold nothing; the points that are written."""
+    for key, parts in held.items():
+        count = sum(map(len, parts))
+        pieces.append((*key, start, count))
+        start += count
+        for part in parts:
+            file.write(part.data)
+    held.clear()
+    return start
 
 
 def _memory(counts: Counts) -> int:
     block = counts["block_points"] * BYTES_PER_BLOCK_POINT
-    return counts["resident_bytes"] + block + WINDOW * BYTES_PER_WINDOW_TILE
+    held = PIECE_POINTS * BYTES_PER_PIECE_POINT
+    return counts["resident_bytes"] + block + held + WINDOW * BYTES_PER_WINDOW_TILE
 
 
 @stage("scatter", version=2, memory=_memory, seconds=5.5e-8)
@@ -212,8 +237,8 @@ def scatter(blocks: Iterator[Block], grid: TileGrid, where: str) -> Iterator[Gro
         SourceError: the source cannot be read whole, or its points are all over the place.
     """
     for block in blocks:
-        points_mm, outside = to_mm(block.points)
-        points, tiles = group(points_mm, grid, where)
+        inside, outside = fitting(np.ascontiguousarray(block.points))
+        points, tiles = group(inside, grid, where)
         yield Grouped(points, tiles, block.dropped, block.left_out, outside)
 
 
@@ -267,77 +292,87 @@ def add_prints(a: tuple[int, int], b: tuple[int, int]) -> tuple[int, int]:
     return (a[0] + b[0]) % 2**64, (a[1] + b[1]) % 2**64
 
 
-def to_mm(points: Float64) -> tuple[Int64, Float64]:
-    """Finite points [m] as whole millimetres, half to even; and those that do not fit the tile grid
-    [m], which are not among them.
-    """
-    limits = np.array([MAX_XY_MM, MAX_XY_MM, MAX_Z_MM], dtype=np.float64)
-    out = np.empty(points.shape, np.int64)
-    if kernels.round_to_mm(points, limits, out) < 0:
-        return out, points[:0]
-    fits = (np.abs(np.rint(points * MM_PER_M)) <= limits).all(axis=1)
-    return to_mm(points[fits])[0], points[~fits]
+def fitting(points: Float64) -> tuple[Float64, Float64]:
+    """The points [m] that fit the tile grid, and those that do not."""
+    limits = np.array([MAX_XY_MM, MAX_XY_MM, MAX_Z_MM])
+    if (np.abs(to_mm(bounds(points))) <= limits).all():
+        return points, points[:0]
+    fits = (np.abs(to_mm(points)) <= limits).all(axis=1)
+    return points[fits], points[~fits]
+
+
+def to_mm(metres: Float64) -> Float64:
+    """Whole millimetres, half to even."""
+    return np.rint(metres * MM_PER_M)
 
 
 def group(
-    points_mm: Int64, grid: TileGrid, where: str
+    points: Float64, grid: TileGrid, where: str
 ) -> tuple[Int32, list[tuple[TileKey, int, Print]]]:
     """Points sorted by the tile that owns them, relative to its origin.
 
     Args:
-        points_mm: (n, 3).
+        points: (n, 3) points that fit the tile grid [m].
         grid: the tiles.
         where: which source and span, for messages.
 
     Returns:
-        The (n, 3) int32 points, and for each tile in their order its key, count and fingerprint.
+        The (n, 3) int32 points [mm], and for each tile in their order its key, count and
+        fingerprint.
 
     Raises:
         CorruptSourceError: the points are spread over more places than those of any real map.
     """
-    if not len(points_mm):
-        return np.zeros((0, 3), np.int32), []
-    tile_mm = grid.tile_mm
-    ix_lo, iy_lo, ix_hi, iy_hi = kernels.tile_bounds(points_mm, tile_mm)
-    rows, window = iy_hi - iy_lo + 1, (ix_hi - ix_lo + 1) * (iy_hi - iy_lo + 1)
-    if window > WIDE:
-        _refuse_spread(points_mm, tile_mm, window, where)
-    if window > WINDOW:
-        return _in_halves(points_mm, grid, where, (ix_lo, iy_lo), (ix_hi, iy_hi))
-    tile_of = np.empty(len(points_mm), np.int32)
-    counts = np.zeros(window, np.int64)
-    kernels.tile_of_points(points_mm, tile_mm, ix_lo, iy_lo, rows, tile_of, counts)
-    grouped = np.empty(points_mm.shape, np.int32)
-    prints = np.zeros((window, 2), np.uint64)
-    next_row = np.cumsum(counts) - counts
-    kernels.group_by_tile(
-        points_mm, tile_of, tile_mm, ix_lo, iy_lo, rows, next_row, grouped, prints
+    lowest, highest = to_mm(bounds(points)[:, :2]).astype(np.int64) // grid.tile_mm
+    columns, rows = (highest - lowest + 1).tolist()
+    if columns * rows > WIDE:
+        _refuse_spread(points, grid.tile_mm, columns * rows, where)
+    if columns * rows > WINDOW:
+        return _in_halves(points, grid, where, lowest, highest)
+    counts, grouped = np.zeros(columns * rows, np.int64), np.empty(points.shape, np.int32)
+    kernels.group_by_tile(points, grid.tile_mm, np.array([*lowest, rows]), counts, grouped)
+    there = np.flatnonzero(counts)
+    of = zip(
+        there.tolist(),
+        counts[there].tolist(),
+        prints_of(grouped, np.cumsum(counts[there])),
+        strict=True,
     )
-    tiles = [
-        (TileKey(ix_lo + t // rows, iy_lo + t % rows), int(counts[t]), tuple(map(int, prints[t])))
-        for t in np.flatnonzero(counts).tolist()
+    column, row = lowest.tolist()
+    return grouped, [
+        (TileKey(column + tile // rows, row + tile % rows), count, fingerprint)
+        for tile, count, fingerprint in of
     ]
-    return grouped, [(key, count, (a, b)) for key, count, (a, b) in tiles]
 
 
-def _refuse_spread(points_mm: Int64, tile_mm: int, window: int, where: str) -> None:
+def prints_of(points: Int32, ends: Int64) -> list[Print]:
+    """The fingerprints of sets of points, one after the other.
+
+    Args:
+        points: (n, 3) points [mm from the tile's origin].
+        ends: (k,) the row behind each set.
+    """
+    return [(first, second) for first, second in kernels.prints_of(points, ends).tolist()]
+
+
+def _refuse_spread(points: Float64, tile_mm: int, window: int, where: str) -> None:
     """Refuse points that halving would part forever."""
     wide = tile_mm * math.isqrt(WINDOW)
-    if len(np.unique(points_mm[:, :2] // wide, axis=0)) > MAX_SPREAD:
+    if len(np.unique(to_mm(points[:, :2]) // wide, axis=0)) > MAX_SPREAD:
         raise CorruptSourceError(
-            f"{where}: a block of {len(points_mm):,} points spans {window:,} tiles of "
+            f"{where}: a block of {len(points):,} points spans {window:,} tiles of "
             f"{tile_mm / MM_PER_M:g} m, all over them: is the file in metres, and its header right?"
         )
 
 
 def _in_halves(
-    points_mm: Int64, grid: TileGrid, where: str, low: tuple[int, int], high: tuple[int, int]
+    points: Float64, grid: TileGrid, where: str, lowest: Int64, highest: Int64
 ) -> tuple[Int32, list[tuple[TileKey, int, Print]]]:
     """As `group`, of few points far apart: the longer side is halved, which most points survive."""
-    axis = 0 if high[0] - low[0] >= high[1] - low[1] else 1
-    border = (low[axis] + high[axis] + 1) // 2 * grid.tile_mm
-    below = points_mm[:, axis] < border
-    halves = [group(points_mm[side], grid, where) for side in (below, ~below) if side.any()]
+    axis = int(np.argmax(highest - lowest))
+    border = (lowest[axis] + highest[axis] + 1) // 2 * grid.tile_mm
+    below = to_mm(points[:, axis]) < border
+    halves = [group(points[side], grid, where) for side in (below, ~below)]
     return np.concatenate([points for points, _ in halves]), [
         t for _, tiles in halves for t in tiles
     ]
