@@ -45,8 +45,11 @@ COMMANDS = {
         "jobs",
         "From a map alone to the localization error everywhere: nobody has to drive there first.",
     ),
-    "ingest": ("maps", "Make a tile store from point clouds, map directories and logs of drives."),
-    "status": ("maps", "Show the tiles of a store: counts, extents, status and reasons."),
+    "ingest": (
+        "ingesting",
+        "Make a tile store from point clouds, map directories and logs of drives.",
+    ),
+    "status": ("state", "Show the tiles of a store: counts, extents, status and reasons."),
     "verify": (
         "maps",
         "Read everything that is stored there; list what is damaged, half-made or lost.",

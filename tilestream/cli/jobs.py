@@ -13,9 +13,10 @@ from tilestream.apps.warm import warm as compile_kernels
 from tilestream.cli.cluster import ALL_CORES, HERE, AllCores, Cluster, on_cluster
 from tilestream.cli.fields import fields, options_named, with_settings
 from tilestream.cli.options import AsJson, Changes, Config, DryRun
+from tilestream.cli.plans import forecast_table, plan_table
 from tilestream.cli.printing import err, out, print_json, say, say_notes
 from tilestream.cli.progress import progress
-from tilestream.cli.tables import forecast_table, plan_table, report_table
+from tilestream.cli.tables import report_table
 from tilestream.errors import LimitError, PartialError, StoreError, UsageError
 from tilestream.files import Files
 from tilestream.pipeline.jobs import run as main_job

@@ -1,128 +1,24 @@
-"""The commands about maps: make a tile store, look into one, compare two."""
+"""The commands that compare what is stored with what was written, and with another map."""
 
-from dataclasses import asdict
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from tilestream.apps import diff as map_diff
 from tilestream.apps import verify as verifying
-from tilestream.cli.cluster import HERE, Cluster, on_cluster
 from tilestream.cli.fields import fields, with_settings
-from tilestream.cli.options import AsJson, DryRun, StoreUrl
+from tilestream.cli.options import AsJson
 from tilestream.cli.printing import err, out, print_json, say, say_notes
-from tilestream.cli.progress import progress
 from tilestream.cli.tables import (
     diff_table,
-    plan_table,
     stretch_table,
-    tile_table,
 )
 from tilestream.errors import LimitError, PartialError
 from tilestream.files import Files
-from tilestream.pipeline.jobs import ingest as ingest_map
-from tilestream.pipeline.jobs.map_expected import tiles_to_read
-from tilestream.pipeline.jobs.map_update import Update, tiles_written
-from tilestream.pipeline.jobs.run_inputs import ingest_settings, scans_of
-from tilestream.pipeline.jobs.sources import map_notes
 from tilestream.report import diff_gate, write_diff
 from tilestream.report.diff.data import WORSE
 from tilestream.report.diff.gate import DiffGateSettings
 from tilestream.report.diff.summary import diff_content
-from tilestream.settings import IngestSettings, LogSettings, MapSettings, PlaceSettings
-from tilestream.store import POINTS, TileStore, open_store
-
-
-@on_cluster
-@with_settings
-def ingest(
-    sources: Annotated[
-        list[str], typer.Argument(help="Files, globs, Autoware map directories, mixed.")
-    ],
-    store: Annotated[str, typer.Option(help="The tile store: a path or an fsspec URL.")],
-    how: Annotated[MapSettings, fields(*IngestSettings.model_fields, *LogSettings.model_fields)],
-    limits: Annotated[PlaceSettings, fields("memory")],
-    dry_run: DryRun = False,
-    as_json: AsJson = False,
-    cluster: Cluster = HERE,
-) -> None:
-    """Make a tile store from point clouds, map directories and logs of drives."""
-    settings, scans, allowed = ingest_settings(how), scans_of(how), limits.memory
-    had = tiles_written(store)
-    if dry_run:
-        planned = ingest_map.plan_ingest(sources, store, settings, allowed, how.log_options, scans)
-        points = planned.expected(tiles_to_read(planned)[0]).points
-        update = Update.between(had, {key: tile.identity for key, tile in points.items()})
-        out.print(plan_table(planned.scatters))
-        if update is not None:
-            say(update.facts(at_most=True)["told"])
-        say_notes(planned.notes)
-        if planned.left_out:
-            raise PartialError(f"{store}: sources that would be left out:", planned.left_out)
-        return
-    failed: PartialError | None = None
-    with cluster.client(allowed) as client, progress() as watch:
-        try:
-            ingest_map.ingest(
-                sources,
-                store,
-                **settings.model_dump(),
-                client=client,
-                memory=allowed,
-                watch=watch,
-                log_options=how.log_options,
-                scans=scans,
-            )
-        except PartialError as error:
-            failed = error
-    made = open_store(store)
-    update = Update.between(had, tiles_written(store))
-    if as_json:
-        print_json({**store_facts(made), "update": None if update is None else update.facts()})
-    else:
-        print_sources(made)
-        out.print(tile_table(made))
-        if update is not None:
-            say(update.facts()["told"])
-    if failed is not None:
-        raise failed
-
-
-def status(
-    store: StoreUrl,
-    as_json: AsJson = False,
-) -> None:
-    """Show the tiles of a store: counts, extents, status and reasons."""
-    opened = open_store(store)
-    marks = opened.marks(POINTS)
-    failures = {f"tile {k}": m.reason for k, m in marks.items() if m.status == "failed"}
-    failures |= {s["path"]: s["reason"] for s in opened.sources() if s["reason"]}
-    condition = opened.condition()
-    failures |= {} if condition.whole else {opened.url: str(condition)}
-    if as_json:
-        print_json(store_facts(opened))
-    else:
-        out.print(tile_table(opened))
-        say(f"The map is {condition}")
-        say_notes(map_notes(opened))
-    if failures:
-        raise PartialError(f"{store}: the map is not whole, or parts of it failed:", failures)
-
-
-def store_facts(store: TileStore) -> dict[str, Any]:
-    """A tile store for machines: its state, its tiles, and what was noticed of its sources."""
-    condition = store.condition()
-    ours = ("scans", "told")  # of each scan of a log, for nobody to read; what notes have too
-    sources = [{k: v for k, v in one.items() if k not in ours} for one in store.sources()]
-    return {
-        "url": store.url,
-        "whole": condition.whole,
-        "condition": str(condition),
-        "settings": asdict(store.settings),
-        "sources": sources,
-        "notes": map_notes(store),
-        "tiles": {str(key): asdict(mark) for key, mark in store.marks(POINTS).items()},
-    }
 
 
 def verify(
@@ -210,12 +106,3 @@ def diff(
         )
     if verdict is not None and verdict.closed:
         raise LimitError(verdict.told)
-
-
-def print_sources(store: TileStore) -> None:
-    """What an ingest read, a line per source."""
-    for source in store.sources():
-        say(f"{source['path']}: {source['format']}, {source['points']:,} points")
-        for line in source.get("contents", ()):  # older stores have none
-            say(f"  {line}")
-    say_notes(map_notes(store), to=out)

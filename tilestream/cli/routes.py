@@ -12,6 +12,7 @@ from tilestream.cli.cluster import HERE, Cluster, on_cluster
 from tilestream.cli.fields import fields, flag, options_named, was_given, with_settings
 from tilestream.cli.given_routes import routes_of
 from tilestream.cli.options import AsJson, DryRun, Routes, StoreUrl, numbers
+from tilestream.cli.plans import plan_table
 from tilestream.cli.printing import out, print_json, say, say_notes
 from tilestream.cli.progress import progress
 from tilestream.cli.tables import (
@@ -19,7 +20,6 @@ from tilestream.cli.tables import (
     error_facts,
     error_table,
     factor_table,
-    plan_table,
 )
 from tilestream.errors import LimitError, PartialError
 from tilestream.factors.catalogue import Which
@@ -30,8 +30,8 @@ from tilestream.notes import MATCHER, noticed
 from tilestream.pipeline.jobs import along_routes
 from tilestream.pipeline.jobs import localize as localize_drive
 from tilestream.pipeline.jobs.drive_measured import drive_measured
-from tilestream.pipeline.jobs.run_inputs import reading_of, scans_of
-from tilestream.pipeline.jobs.sources import map_notes
+from tilestream.pipeline.jobs.run_inputs import reading_of
+from tilestream.pipeline.jobs.sources import map_notes, scans_of
 from tilestream.pipeline.stages.drive_scans import opened as opened_log
 from tilestream.pipeline.stages.factors import Looking
 from tilestream.pipeline.stages.map_plan import MapPlan

@@ -9,60 +9,11 @@ from rich.box import SIMPLE
 from rich.table import Table
 
 from tilestream.factors.catalogue import COLUMNS
-from tilestream.pipeline.engine.plan import Plan, megabytes
 from tilestream.report.diff.data import TILES, MapDiff
 from tilestream.report.drives import DriveMeasured
 from tilestream.report.formatting import cm, cm_about, distance
 from tilestream.report.paper_tables import LIMITS
 from tilestream.report.summary import digits_of
-from tilestream.store import POINTS, TileStore
-
-
-def tile_table(store: TileStore) -> Table:
-    """The tiles of a store with status, counts and extents."""
-    table = Table(title=str(store), title_justify="left", box=SIMPLE)
-    for column in ("tile", "status", "points", "read", "lowest [m]", "highest [m]", "reason"):
-        right = column in ("points", "read")
-        table.add_column(column, justify="right" if right else "left", no_wrap=column != "reason")
-    for key, mark in store.marks(POINTS).items():
-        facts = mark.facts
-        lowest, highest = (
-            " ".join(f"{value:z.1f}" for value in facts.get(end, ()))
-            for end in ("lowest", "highest")
-        )
-        points, read = (f"{facts[name]:,}" if name in facts else "" for name in ("points", "read"))
-        table.add_row(str(key), mark.status, points, read, lowest, highest, mark.reason)
-    return table
-
-
-def plan_table(plan: Plan) -> Table:
-    """The stages of a plan with their tasks and promised memory."""
-    table = Table(title="plan", title_justify="left", box=SIMPLE)
-    for column in ("stage", "tasks", "promised memory per task"):
-        table.add_column(column, justify="left" if column == "stage" else "right")
-    for stage, count, promise in plan.describe():
-        table.add_row(stage, str(count), megabytes(promise))
-    return table
-
-
-def forecast_table(rows: list[dict[str, object]]) -> Table:
-    """The same for people."""
-    table = Table(title="plan", title_justify="left", box=SIMPLE)
-    table.add_column("stage")
-    for column in ("tasks", "work", "to do", "memory per task", "core-hours"):
-        table.add_column(column, justify="right")
-    table.add_column("after")
-    for row in rows:
-        after = ", ".join(row["after"]) if isinstance(row["after"], list) else ""
-        memory = megabytes(int(str(row["promised_bytes"])))
-        hours = f"{float(str(row['core_hours'])):.3f}"
-        work, left = (f"{row[name]:,}" for name in ("work", "to_do"))
-        table.add_row(str(row["stage"]), str(row["tasks"]), work, left, memory, hours, after)
-    total = sum(float(str(row["core_hours"])) for row in rows)
-    table.add_row(
-        "all", str(sum(int(str(row["tasks"])) for row in rows)), "", "", "", f"{total:.3f}", ""
-    )
-    return table
 
 
 def factor_table(rows: pd.DataFrame) -> Table:

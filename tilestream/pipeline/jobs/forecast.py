@@ -18,7 +18,6 @@ from tilestream.pipeline.jobs.run_inputs import (
     check_files,
     check_model,
     extent,
-    ingest_settings,
     inputs_of,
     is_simulated,
     map_scans,
@@ -29,7 +28,7 @@ from tilestream.pipeline.jobs.run_notes import with_logs
 from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
 from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.jobs.simulate import plan_simulation
-from tilestream.pipeline.jobs.sources import map_notes
+from tilestream.pipeline.jobs.sources import ingest_settings, map_notes
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.predict import predict
 from tilestream.settings import SimulateSettings

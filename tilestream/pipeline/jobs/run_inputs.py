@@ -23,6 +23,7 @@ from tilestream.pipeline.jobs.map_reading import Reading
 from tilestream.pipeline.jobs.run_routes import routes_in, routes_of_map
 from tilestream.pipeline.jobs.run_settings import RunSettings, one_of_each
 from tilestream.pipeline.jobs.simulate import simulate
+from tilestream.pipeline.jobs.sources import ingest_settings, scans_of
 from tilestream.pipeline.stages.drive_scans import Reading as DriveReading
 from tilestream.pipeline.stages.observe import Observing
 from tilestream.pipeline.stages.samples import COLUMNS
@@ -31,9 +32,6 @@ from tilestream.report.drives import DriveMeasured
 from tilestream.sensor import Sensor
 from tilestream.settings import (
     DriveSettings,
-    IngestSettings,
-    LogSettings,
-    MapSettings,
     SimulateSettings,
     VirtualSettings,
 )
@@ -201,25 +199,11 @@ def read_map(settings: RunSettings, inputs: Inputs) -> Reading | None:
     )
 
 
-def ingest_settings(settings: MapSettings) -> IngestSettings:
-    """How a map is cut into tiles."""
-    return IngestSettings(**settings.model_dump(include=set(IngestSettings.model_fields)))
-
-
 def map_scans(settings: RunSettings, inputs: Inputs) -> ScanSelection | None:
     """Which scans of logs become the map; None: there are no logs among the sources."""
     if any(map(is_log, inputs.sources)):
         return scans_of(settings.map)
     return None
-
-
-def scans_of(log: LogSettings) -> ScanSelection:
-    """Which scans of a log are used.
-
-    Raises:
-        UsageError: an offset that is not below `every`.
-    """
-    return ScanSelection(every=log.every, offset=log.offset, from_s=log.from_s, until_s=log.until_s)
 
 
 def is_simulated(settings: RunSettings) -> bool:

@@ -19,11 +19,10 @@ from tilestream.pipeline.jobs.run_inputs import (
     JOB,
     Inputs,
     reading_of,
-    scans_of,
     seen_otherwise,
 )
 from tilestream.pipeline.jobs.run_settings import RunSettings
-from tilestream.pipeline.jobs.sources import map_notes
+from tilestream.pipeline.jobs.sources import map_notes, scans_of
 from tilestream.pipeline.stages.drive_scans import opened
 from tilestream.pipeline.stages.label import label
 from tilestream.report.drives import DriveMeasured

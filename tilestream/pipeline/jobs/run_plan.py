@@ -31,9 +31,9 @@ from tilestream.pipeline.jobs.run_inputs import (
     observing_drive,
     observing_of,
     reading_of,
-    scans_of,
 )
 from tilestream.pipeline.jobs.run_settings import RunSettings
+from tilestream.pipeline.jobs.sources import scans_of
 from tilestream.pipeline.stages.evaluate import evaluate
 from tilestream.pipeline.stages.factors import Looking, factors_drive
 from tilestream.pipeline.stages.importance import importance

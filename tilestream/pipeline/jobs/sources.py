@@ -20,7 +20,7 @@ from tilestream.pipeline.engine.plan import megabytes
 from tilestream.pipeline.jobs.overlap import packed
 from tilestream.pipeline.jobs.strays import Kept
 from tilestream.pipeline.stages.scatter import Fragment, needed_to_open
-from tilestream.settings import IngestSettings, LogOptions
+from tilestream.settings import IngestSettings, LogOptions, LogSettings, MapSettings
 from tilestream.store import TileStore, open_store
 
 POINTS_PER_TASK = 4_000_000
@@ -223,3 +223,17 @@ def _without_logs(sources: Iterable[str]) -> Iterator[str]:
             yield source
         elif not Path(source).exists():
             yield from (path for path in matches_of(source) if not is_log(path))
+
+
+def ingest_settings(settings: MapSettings) -> IngestSettings:
+    """How a map is cut into tiles."""
+    return IngestSettings(**settings.model_dump(include=set(IngestSettings.model_fields)))
+
+
+def scans_of(log: LogSettings) -> ScanSelection:
+    """Which scans of a log are used.
+
+    Raises:
+        UsageError: an offset that is not below `every`.
+    """
+    return ScanSelection(every=log.every, offset=log.offset, from_s=log.from_s, until_s=log.until_s)
