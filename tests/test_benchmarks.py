@@ -24,6 +24,7 @@ SCRIPTS = sorted(path.name for path in FOLDER.glob("*.py") if "__main__" in path
 SHIPPED = ROOT / "tilestream" / "data"
 DOCUMENTS = (FOLDER / "RESULTS.md", ROOT / "pipelines" / "README.md")
 SMALLEST = (
+    "coarse.py canyon.mcap --every 4 --tolerance 0.1 --range-max 14",
     "drive.py canyon.mcap --figures figures",
     "drives.py canyon.mcap --out runs --sensor VLP16 --height 2 --range 14 --set starts=16",
     "encryption.py --rounds 1 --turns 1 --tasks 10 --tiles 1",

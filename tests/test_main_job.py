@@ -61,6 +61,7 @@ from tilestream.pipeline.stages.terms import terms
 from tilestream.report import pictures
 from tilestream.report.evaluation import MODELS
 from tilestream.settings import (
+    CoarseSettings,
     DriveSettings,
     LabelSettings,
     MapSettings,
@@ -676,7 +677,7 @@ def test_the_template_is_a_job_and_explains_every_setting(
     (tmp_path / "job.yaml").write_text(text)
     assert read_settings(tmp_path / "job.yaml").out == str(Path("my-city").absolute())
     groups = [RunSettings, SimulateSettings, MapSettings, DriveSettings, VirtualSettings]
-    groups += [LabelSettings, ModelSettings, ReportSettings]
+    groups += [CoarseSettings, LabelSettings, ModelSettings, ReportSettings]
     settings = {name for group in groups for name in group.model_fields}
     explained = set(re.findall(r"^[ #-]*\{?(\w+):", text, flags=re.MULTILINE))
     assert explained == settings
@@ -899,6 +900,7 @@ def test_a_gate_does_not_open_on_places_that_nobody_estimated(
     (tmp_path / "report").mkdir()
     estimate = [0.1] * 90 + [None] * 10
     places = pd.DataFrame({"route_id": "a", "arc_length": range(100), "estimate": estimate})
+    places["status"] = "done"
     places.to_parquet(tmp_path / "report" / "places.parquet")
     (tmp_path / "report" / "report.json").write_text(json.dumps({"drives": []}))
     with pytest.raises(LimitError, match="10 of 100 sample points have no estimate"):

@@ -309,6 +309,20 @@ def test_neither_tiling_nor_company_nor_order_shows(street: Path, tmp_path: Path
     assert alone.iloc[0].tolist() == tables[0].iloc[1].tolist()
 
 
+def test_what_is_mapped_is_what_this_place_has_in_view(tmp_path: Path) -> None:
+    """Where the road ends, a block stands that only the other place sees."""
+    rng = np.random.default_rng(5)
+    ground = rng.uniform((0, 0, 0), (40, 60, 0.02), (60_000, 3))
+    block = rng.uniform((48.5, 20.5, 0), (49.5, 21.5, 2), (6_000, 3))
+    write_pcd(tmp_path / "ground.pcd", np.vstack([ground, block]))
+    store = ts.ingest(tmp_path / "ground.pcd", tmp_path / "map.zarr")
+    places = np.array([[26.0, 25.0, 2.0], [39.0, 25.0, 2.0]])  # which share a scene
+    together = look(store, places, [0.0, 0.0])["ob_unmapped"]
+    alone = [look(store, places[k : k + 1], [0.0])["ob_unmapped"][0] for k in range(2)]
+    assert together.tolist() == alone
+    assert 0.0 < alone[0] < 1.0
+
+
 def test_a_wider_crop_of_the_map_shows_nothing_more(store: ts.TileStore) -> None:
     everything = surfels_in(store, Box(-10_000, -30_000, 50_000, 30_000))
     place = np.array([PLACE])

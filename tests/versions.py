@@ -230,6 +230,10 @@ def golden(folder: Path) -> dict[str, Any]:
     near = [{"log": str(folder / "canyon.mcap"), "name": "near", "range_max": 10.0}]
     physics = {"drives": near, "model": {"recipe": "physics"}}
     ts.run(streets.job(folder, folder / "near", observe=observing, label=label, **physics))
+    logs = [str(folder / f"{kind}.mcap") for kind in streets.STREETS]
+    coarse = {"drives": [], "routes": logs, "model": {"recipe": "physics", "offset": 0.0}}
+    coarse |= {"coarse": {"every": 2, "tolerance": 1.0, "high": 9.0}}
+    ts.run(streets.job(folder, folder / "coarse", observe=observing, label=label, **coarse))
     executor.attempt = attempt
     return {
         "tables": {name: digest(sorted(keys.items())) for name, keys in sorted(made.items())},

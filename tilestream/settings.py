@@ -263,6 +263,23 @@ class VirtualSettings(Settings):
         return self
 
 
+class CoarseSettings(Settings):
+    """Coarse first: which places are evaluated, by a virtual drive (definitions, section 4.6)."""
+
+    every: Annotated[int, Field(ge=2)] = 8
+    """First about one place in so many is evaluated: some in groups, with all that the model reads
+    of their neighbours, some alone, to see what lies between."""
+    tolerance: Positive = 0.05
+    """Places between two groups are interpolated where all that is known there is so near to the
+    line between them [m]; a check tells how often an interpolated one is farther off …"""
+    high: Positive = 0.2
+    """… and where none is above this [m]."""
+    checks: Annotated[int, Field(ge=0)] = 200
+    """So many interpolated places are evaluated for that check, at most one in 50 of them."""
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    """Seed of the choice of these."""
+
+
 class LabelSettings(Settings):
     """How errors are measured: the matcher decides them (definitions, section 5)."""
 

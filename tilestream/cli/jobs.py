@@ -21,7 +21,7 @@ from tilestream.errors import LimitError, PartialError, StoreError, UsageError
 from tilestream.files import Files
 from tilestream.pipeline.jobs import run as main_job
 from tilestream.pipeline.jobs import simulate as simulation
-from tilestream.pipeline.jobs.estimate import OUT, estimate_settings
+from tilestream.pipeline.jobs.estimate import OUT, coarse_settings, estimate_settings
 from tilestream.pipeline.jobs.forecast import forecast
 from tilestream.pipeline.jobs.run_book import told_before
 from tilestream.pipeline.jobs.run_inputs import check_files, extent, simulations
@@ -30,11 +30,13 @@ from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
 from tilestream.pipeline.stages.simulated import SCENE_BYTES
 from tilestream.records import District
 from tilestream.report import cards, gate
+from tilestream.report.data import interpolated
 from tilestream.report.drives import EVALUATED, DriveMeasured
 from tilestream.report.formatting import cm, distance
 from tilestream.report.gate import GateSettings, Over
 from tilestream.report.measured import Measured
 from tilestream.settings import (
+    CoarseSettings,
     LabelSettings,
     LogSettings,
     MapSettings,
@@ -51,6 +53,7 @@ def template() -> None:
     out.out(verbs.template(), end="", highlight=False)
 
 
+COARSE = CoarseSettings()
 GATE = fields("fail_over", "measure", "over")
 
 
@@ -91,6 +94,21 @@ def estimate(
             show_default="shipped, where one is",
         ),
     ] = None,
+    coarse: Annotated[
+        int | None,
+        typer.Option(
+            help="Evaluate about one place in so many first, others only where errors are high or "
+            "change fast, and interpolate the rest; not given: all."
+        ),
+    ] = None,
+    tolerance: Annotated[
+        float | None,
+        typer.Option(
+            help="With --coarse: how far off an interpolated estimate may be [m]; a check tells "
+            "how often it is more.",
+            show_default=f"{COARSE.tolerance}",
+        ),
+    ] = None,
     folder: Annotated[str, typer.Option("--out", help="The run directory.")] = OUT,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="As `plan`.")] = False,
     as_json: AsJson = False,
@@ -109,9 +127,18 @@ def estimate(
     It ends by printing what the estimates are worth, the headline, and where the report is. The
     same command continues a job that was stopped. `tilestream run` learns from drives too.
     """
-    with options_named({"out": "--out"}):
+    with options_named({"out": "--out", "every": "--coarse", "tolerance": "--tolerance"}):
         settings = estimate_settings(
-            sources, route, folder, model, places, seeing, labels, which_map, report
+            sources,
+            route,
+            folder,
+            model,
+            places,
+            seeing,
+            labels,
+            which_map,
+            report,
+            coarse_settings(coarse, tolerance),
         )
     if dry_run:
         show_plan(settings, as_json)
@@ -253,7 +280,9 @@ def require_within(
     table = io.BytesIO(folder.under("report/places.parquet").read())
     places = pd.read_parquet(table)
     missing = int(places["estimate"].isna().sum())
-    say(f"{missing:,} of {len(places):,} sample points have no estimate", to=err)
+    between = int(interpolated(places).sum())
+    told = f"; {between:,} are interpolated, not evaluated" if between else ""
+    say(f"{missing:,} of {len(places):,} sample points have no estimate{told}", to=err)
     closed = gate(places, limit, report_of(folder)["drives"], measure, over)
     if closed:
         raise LimitError("; ".join(closed))

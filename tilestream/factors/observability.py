@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from tilestream.errors import RegistrationError, TileNotReadyError, UsageError
 from tilestream.factors.hessian import HESSIAN_COLUMNS, hessian_factors, turned_by
 from tilestream.factors.seen_from import SURVEY_COLUMNS, survey_factors
-from tilestream.factors.surfels import Surfels, in_view, surfel_mm, surfels_in
+from tilestream.factors.surfels import Surfels, can_be_met, in_view, surfel_mm, surfels_in
 from tilestream.factors.table import NO_GROUND, places_of
 from tilestream.factors.virtual_drive import COLUMNS as DRIVE_COLUMNS
 from tilestream.factors.virtual_drive import Ends, ends_of, stratified_starts, virtual_drive
@@ -190,6 +190,7 @@ class _View:
             for draw in (0, *range(draws - self.seeing.worlds, draws))
         )
         return _Block(
+            near,
             scene,
             first,
             tuple(others),
@@ -216,16 +217,22 @@ class _View:
 
     def seen_from(self, around: "_Block | None", place: Float64, heading: float) -> Row:
         """The row of a place; columns that are not known there are left out."""
+        nothing: Row = {"status": "missing", "reason": NOTHING.format(0, len(self.beams))}
         if around is None:
-            return {"status": "missing", "reason": NOTHING.format(0, len(self.beams))}
+            return nothing
+        fov, rim = self.fov_deg, self.beams.rim
+        own = can_be_met(around.near, place[None], fov, self.beams.range_max, rim)
+        if not own.any():
+            return nothing
         place_mm = whole_places(place)
         walled = near_share(around.scene, place_mm, self.beams, self.seeing.range_min)
         if walled > INSIDE:
             reason = WALLED.format(walled, self.seeing.range_min)
             return {"status": "failed", "reason": reason}
         whole = look(around.scene, place_mm, heading, self.seeing, self.beams)
-        found = look_past(around.mapped, whole, self.seeing, self.beams)
-        scan = virtual_scan(around.mapped, found, place_mm, self.seeing, self.beams)
+        mapped = around.mapped.seen_from(own)
+        found = look_past(mapped, whole, self.seeing, self.beams)
+        scan = virtual_scan(mapped, found, place_mm, self.seeing, self.beams)
         view: Row = {
             "ob_returns": scan.return_share,
             "ob_unmapped": scan.unmapped_share,
@@ -243,8 +250,9 @@ class _View:
             drives = self.drives(around.cells, scans, T_map_lidar)
         except RegistrationError as error:
             return {**view, "status": "failed", "reason": str(error)}
-        own = around.cells.cells if isinstance(around.cells, LocalCells) else around.cells
-        survey = survey_factors(own, scan.points, T_map_lidar)
+        cells = around.cells
+        cells = cells.cells if isinstance(cells, LocalCells) else cells
+        survey = survey_factors(cells, scan.points, T_map_lidar)
         return {**view, **held, **survey, **virtual_drive(drives), "status": "done", "reason": ""}
 
     def scans(
@@ -298,8 +306,10 @@ class _View:
 class _Block:
     """What places near one another share."""
 
+    near: Surfels
+    """What is in view of any of them."""
     scene: Scene
-    """What is in view."""
+    """The same as a scene."""
     mapped: Scene
     """The same without the balls that beams pass by …"""
     worlds: tuple[Scene, ...]

@@ -209,10 +209,23 @@ def in_view(
     reach: float,
     rim: float = 0.0,
 ) -> Surfels:
-    """The surfels that a beam from any of the places can meet, and a few more.
+    """The surfels that a beam from any of the places can meet, and a few more; arguments as of
+    `can_be_met`.
+    """
+    return surfels.where(can_be_met(surfels, places, fov_deg, reach, rim))
+
+
+def can_be_met(
+    surfels: Surfels,
+    places: Float64,
+    fov_deg: tuple[float, float],
+    reach: float,
+    rim: float = 0.0,
+) -> NDArray[np.bool_]:
+    """(n,) which surfels a beam from any of the places can meet, and a few more.
 
     Args:
-        surfels: the surfels around the places.
+        surfels: (n,) the surfels around the places.
         places: (k, 3) places [m, map frame], best near one another.
         fov_deg: lowest and highest elevation of the beams [deg].
         reach: range of the beams [m].
@@ -228,4 +241,6 @@ def in_view(
     bottom, top = up.min() - 1.0 - rim, up.max() + 1.0 + rim
     floor = bottom + low * (far if low < 0.0 else near)
     ceiling = top + high * (far if high > 0.0 else near)
-    return surfels.where((near <= reach) & (offset[:, 2] >= floor) & (offset[:, 2] <= ceiling))
+    height = offset[:, 2]
+    met: NDArray[np.bool_] = (near <= reach) & (height >= floor) & (height <= ceiling)
+    return met

@@ -42,9 +42,11 @@ class Scene:
     bricks: Bricks
     """Index of the surfels by voxel."""
     mapped: NDArray[np.bool_]
-    """(nx, ny) columns of 10 m that hold any of the map."""
+    """(nx, ny) columns of 10 m that hold any of the map in view."""
     mapped_corner: Int64
     """(2,) their lowest corner [mm, map frame]."""
+    column: NDArray[np.intp]
+    """(n,) in which of these columns each surfel lies."""
 
     @classmethod
     def of(cls, surfels: Surfels, places_mm: Int64, edge_mm: int) -> "Scene":
@@ -67,14 +69,24 @@ class Scene:
         grid = np.full(tuple(shape), FREE, np.int32)
         voxels = np.full((mark_bricks(table, edge_mm, grid), VOXELS), FREE, np.int32)
         fill_bricks(table, edge_mm, grid, voxels)
-        column = surfels.centre_mm[:, :2] // COLUMN_MM
-        mapped_low = column.min(axis=0)
-        mapped = np.zeros(tuple(column.max(axis=0) - mapped_low + 1), np.bool_)
-        mapped[tuple((column - mapped_low).T)] = True
         bounds = bound_bricks(edge_mm, grid, voxels)
         none = np.zeros(len(surfels), np.bool_)
         bricks = Bricks(edge_mm, corner, grid, voxels, bounds, table, none)
-        return cls(bricks, mapped, mapped_low * COLUMN_MM)
+        column = surfels.centre_mm[:, :2] // COLUMN_MM
+        mapped_low = column.min(axis=0)
+        in_columns = tuple((column - mapped_low).T)
+        mapped = np.zeros(tuple(column.max(axis=0) - mapped_low + 1), np.bool_)
+        mapped[in_columns] = True
+        flat = np.ravel_multi_index(in_columns, mapped.shape)
+        return cls(bricks, mapped, mapped_low * COLUMN_MM, flat)
+
+    def seen_from(self, in_view: NDArray[np.bool_]) -> "Scene":
+        """The same scene for a place that has only some of its surfels (n,) in view: what is mapped
+        there must not depend on the other places.
+        """
+        mapped = np.zeros_like(self.mapped)
+        mapped.flat[self.column[in_view]] = True
+        return replace(self, mapped=mapped)
 
     def without(self, gone: NDArray[np.bool_]) -> "Scene":
         """The same scene, some of its surfels (n,) left out."""

@@ -77,7 +77,14 @@ PREDICTION_COLUMNS = (
         "distance at most the 99 % quantile of held-out blocks",
         dtype="bool",
     ),
-    Column("status", "place", "", "done, or missing: no estimate.", "", dtype="str"),
+    Column(
+        "status",
+        "place",
+        "",
+        "done, interpolated (not evaluated), or missing: no estimate.",
+        "",
+        dtype="str",
+    ),
     Column(
         "reason",
         "place",

@@ -22,7 +22,7 @@ from tilestream.records import Float64, Int64
 from tilestream.report.charts import finish, hover, item, new_plot
 from tilestream.report.colours import HERE, MISSING, Scale
 from tilestream.report.covariance import registrations_told
-from tilestream.report.data import Findings, estimates, like_training
+from tilestream.report.data import Findings, estimates, interpolated, like_training
 from tilestream.report.formatting import CM_PER_M, cm, cm_about, cm_by_name, cm_span, percent
 from tilestream.report.lines import points_per_mark, worst_of_every
 from tilestream.report.measured import measure_of
@@ -68,8 +68,8 @@ def city_map(found: Findings, tip: str) -> dict[str, Any]:
     """The sample points coloured by estimate, the worst on top and numbered, as an item for
     `Bokeh.embed.embed_item`.
 
-    The data sources are named `above`, `in_domain`, `outside`, `unjudged`, `missing`, `measured`,
-    `worst` and `here`.
+    The data sources are named `above`, `in_domain`, `outside`, `unjudged`, `interpolated`,
+    `missing`, `measured`, `worst` and `here`.
 
     Args:
         found: what is reported.
@@ -87,6 +87,7 @@ def city_map(found: Findings, tip: str) -> dict[str, Any]:
         ("in_domain", "circle", "like the training places"),
         ("outside", "diamond", "unlike the training places"),
         ("unjudged", "circle", "estimated without training"),
+        ("interpolated", "circle", "interpolated, not evaluated"),
         ("missing", "x", "no estimate"),
     ):
         rows = drawn[kinds[drawn] == kind]
@@ -100,6 +101,8 @@ def city_map(found: Findings, tip: str) -> dict[str, Any]:
             else {"color": {"field": "step", "transform": mapper}, "size": "size"}
         )
         style |= {"marker": marker, "legend_label": name, "view": _choosable()}
+        if kind == "interpolated":
+            style |= {"fill_alpha": 0.0}
         glyphs = plot.scatter("x", "y", source=source, **style)
         # of the dots under the mouse the worst, which is the one on top
         plot.add_tools(hover(glyphs, tip, sort_by=[("estimate", -1)]))
@@ -179,7 +182,8 @@ def map_shows_every(found: Findings) -> int:
 def _kinds(places: pd.DataFrame) -> NDArray[np.str_]:
     known = np.isfinite(estimates(places))
     names = {"yes": "in_domain", "no": "outside", "not known": "unjudged"}
-    return np.where(known, [names[like] for like in like_training(places)], "missing")
+    kinds = np.where(known, [names[like] for like in like_training(places)], "missing")
+    return np.where(interpolated(places), "interpolated", kinds)
 
 
 def origin_of(places: pd.DataFrame) -> Float64:

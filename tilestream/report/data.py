@@ -9,6 +9,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from tilestream.errors import UsageError
+from tilestream.factors.stations import INTERPOLATED
 from tilestream.formats.routes import Lane
 from tilestream.from_above import FromAbove
 from tilestream.model.registry import DEFAULT
@@ -185,8 +186,16 @@ def estimates(places: pd.DataFrame) -> Float64:
     return places["estimate"].to_numpy(np.float64)
 
 
+def interpolated(places: pd.DataFrame) -> NDArray[np.bool_]:
+    """(n,) whether an estimate is that of places before and behind it: it was not evaluated."""
+    found: NDArray[np.bool_] = (places["status"] == INTERPOLATED).to_numpy(bool)
+    return found
+
+
 def like_training(places: pd.DataFrame) -> NDArray[np.str_]:
-    """(n,) `yes`, `no`, or `not known`: no estimate, or nothing was trained."""
+    """(n,) `yes`, `no`, or `not known`: no estimate, one that is interpolated, or nothing was
+    trained.
+    """
     like = places["in_domain"].astype("boolean")
     known = like.notna().to_numpy() & np.isfinite(estimates(places))
     return np.where(known, np.where(like.fillna(False).to_numpy(bool), "yes", "no"), "not known")

@@ -9,6 +9,7 @@ from pydantic import Field, field_validator
 
 from tilestream.config import Settings
 from tilestream.model.figures import SEGMENT
+from tilestream.report.data import interpolated
 from tilestream.report.drives import EVALUATED
 from tilestream.report.measured import Measured, measure_of
 from tilestream.report.segments import check_threshold
@@ -59,14 +60,14 @@ def gate(
 ) -> list[str]:
     """Why a map does not pass a limit; empty: it passes.
 
-    A measured error counts as an estimate does. What is not known does not pass: a route without
-    any estimate fails the gate, and so does one of whose places less than `EVALUATED` have one, a
-    drive that was not evaluated to that share, and a map of which more than `MISSING` of the places
-    have no estimate.
+    A measured error counts as an estimate does, and an interpolated one as any other. What is not
+    known does not pass: a route without any estimate fails the gate, and so does one of whose
+    places less than `EVALUATED` have one, a drive that was not evaluated to that share, and a map
+    of which more than `MISSING` of the places have no estimate.
 
     Args:
-        places: route_id, arc_length [m] and the estimates of every sample point, with what was
-            measured there (`with_measured`).
+        places: route_id, arc_length [m], status and the estimates of every sample point, with what
+            was measured there (`with_measured`).
         limit: greatest error that passes [m]; of p_fail a share.
         drives: how much of each drive was measured (`DriveMeasured.plain`).
         measure: the part of the error that is asked for (`MEASURES`).
@@ -80,16 +81,20 @@ def gate(
     estimate, known_error = one.estimate, one.known
     found, total = [], len(places)
     judged = places[["route_id", "arc_length"]].assign(
-        error=known_error, measured=known_error == one.measured
+        error=known_error,
+        measured=known_error == one.measured,
+        interpolated=interpolated(places) & ~np.isfinite(one.measured),
     )
     judged = windows(judged) if over == "segments" else judged
     above = judged[judged["error"] > limit]
     if len(above):
         worst = above.iloc[int(np.argmax(above["error"]))]
         unit = "" if measure == "p_fail" else " m"
+        between = int(above["interpolated"].sum())
         what = "sample points" if over == "places" else f"segments of {SEGMENT:g} m"
         found.append(
-            f"{measure}: {len(above)} of {len(judged)} {what} are above {limit:g}{unit}, the worst "
+            f"{measure}: {len(above)} of {len(judged)} {what} are above {limit:g}{unit}"
+            f"{f' ({between} of them interpolated)' if between else ''}, the worst "
             f"{worst['error']:.2f}{unit} on {worst['route_id']} at {worst['arc_length']:.0f} m, "
             f"{'measured' if worst['measured'] else 'estimated'}"
         )
@@ -119,12 +124,12 @@ def gate(
 
 def windows(judged: pd.DataFrame) -> pd.DataFrame:
     """Means of `error` over each `SEGMENT` of a route, of the places that have one; `measured`
-    where any of them is.
+    where any of them is, `interpolated` where all are.
     """
     there = judged[judged["error"].notna()]
     number = (there["arc_length"] // SEGMENT).rename("number")
     parts = there.groupby(["route_id", number])
-    how = {"error": "mean", "arc_length": "min", "measured": "any"}
+    how = {"error": "mean", "arc_length": "min", "measured": "any", "interpolated": "all"}
     return parts.agg(how).reset_index()
 
 

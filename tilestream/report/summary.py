@@ -11,7 +11,13 @@ from tilestream.model.evaluation import PAPER_TABLE
 from tilestream.model.figures import with_spans
 from tilestream.model.training import PREDICTION_COLUMNS
 from tilestream.records import Float64, Int64
-from tilestream.report.data import PLACE_COLUMNS, Findings, estimates, like_training
+from tilestream.report.data import (
+    PLACE_COLUMNS,
+    Findings,
+    estimates,
+    interpolated,
+    like_training,
+)
 from tilestream.report.formatting import cm, cm_about, distance, known, percent, thousands
 from tilestream.report.measured import measure_of
 from tilestream.report.paper_tables import paper_table_i, paper_table_iii, table_i, table_iii
@@ -86,6 +92,7 @@ def headline(places: pd.DataFrame, threshold: float) -> dict[str, Any]:
         "routes": int(places["route_id"].nunique()),
         "length": float(reach.sum()),
         "estimated": int(there.sum()),
+        "interpolated": int(interpolated(places).sum()),
         **quantiles(here),
         "over": int(over.sum()),
         "over_share": float(over.sum() / known_count) if known_count else None,
@@ -134,7 +141,8 @@ def cards(content: Mapping[str, Any]) -> list[tuple[str, str]]:
     of_drives = (f"{thousands(measured)} of {thousands(scans)}", "scans of the drives measured")
     there = f"the largest measured error, of {thousands(head['measured'])} places"
     highest = (cm(head["measured_max"]), there)
-    evaluated = f"{thousands(head['estimated'])} of {thousands(head['places'])}"
+    between = head["interpolated"]
+    evaluated = f"{thousands(head['estimated'] - between)} of {thousands(head['places'])}"
     missing = f"places without an estimate ({percent(head['missing_share'])})"
     return [
         (distance(head["length"]), f"of road, {thousands(head['places'])} sample points"),
@@ -145,6 +153,7 @@ def cards(content: Mapping[str, Any]) -> list[tuple[str, str]]:
         (percent(head["over_share"]), over),
         *([unlike] if known(head["outside_share"]) else []),
         (evaluated, "places evaluated"),
+        *([(thousands(between), "places interpolated between these")] if between else []),
         *([of_drives] if drives else []),
         (thousands(head["labelled"]), "measured errors to train on and to judge by"),
         (thousands(head["missing"]), missing),

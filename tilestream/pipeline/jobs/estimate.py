@@ -20,6 +20,7 @@ from tilestream.pipeline.jobs.run_settings import ModelSettings, RunSettings
 from tilestream.sensor import VLP16, Carrier, sensor_of
 from tilestream.settings import (
     PREDICTION_ERROR,
+    CoarseSettings,
     LabelSettings,
     MapSettings,
     PlaceSettings,
@@ -50,6 +51,8 @@ def estimate(
     crs: str | None = None,
     project_to: str | None = None,
     threshold: float = 0.25,
+    coarse: int | None = None,
+    tolerance: float | None = None,
     client: Any | None = None,
     memory: int = DEFAULT_MEMORY,
     watch: Watch | None = None,
@@ -78,6 +81,9 @@ def estimate(
         crs: CRS of the map, where its files do not say.
         project_to: CRS to project routes to; None: the map's.
         threshold: estimates above this are listed as segments [m].
+        coarse: evaluate about one place in so many first, others only where errors are high or
+            change fast, and interpolate the rest; None: evaluate all.
+        tolerance: with `coarse`: how far off an interpolated estimate may be [m]; None: 0.05.
         client: a Dask client to run on; None: this process.
         memory: what a task may use [bytes].
         watch: is told of each task that ended.
@@ -103,8 +109,22 @@ def estimate(
         LabelSettings(matcher=matcher if isinstance(matcher, Settings) else str(matcher)),
         MapSettings(crs=crs),
         ReportSettings(threshold=threshold),
+        coarse_settings(coarse, tolerance),
     )
     return run(settings, client, watch)
+
+
+def coarse_settings(every: int | None, tolerance: float | None) -> CoarseSettings | None:
+    """What is evaluated first; None: all is evaluated.
+
+    Raises:
+        UsageError: a tolerance without `every`, or values that cannot be.
+    """
+    if every is None and tolerance is not None:
+        raise UsageError("tolerance (--tolerance) is of a coarse run: give coarse (--coarse) too")
+    given: dict[str, Any] = {"every": every, "tolerance": tolerance}
+    known = {name: value for name, value in given.items() if value is not None}
+    return CoarseSettings(**known) if known else None
 
 
 def _listed(named: Named | Iterable[Named]) -> list[str]:
@@ -122,6 +142,7 @@ def estimate_settings(
     label: LabelSettings,
     map_: MapSettings,
     report: ReportSettings,
+    coarse: CoarseSettings | None = None,
 ) -> RunSettings:
     """The job of an estimate: what is not given keeps the defaults of the main job.
 
@@ -135,6 +156,7 @@ def estimate_settings(
         label: its matcher.
         map_: how the map is made, but for `sources` and `store`.
         report: what is pointed out.
+        coarse: what is evaluated first; None: all.
 
     Raises:
         UsageError: a store among other sources, or values that cannot be.
@@ -151,6 +173,7 @@ def estimate_settings(
         label=label,
         model=of_model,
         report=report,
+        coarse=coarse,
     )
 
 

@@ -12,6 +12,7 @@ from tilestream.pipeline.jobs.along_routes import off_map
 from tilestream.pipeline.jobs.estimator import estimator_of
 from tilestream.pipeline.jobs.ingest import plan_ingest
 from tilestream.pipeline.jobs.map_expected import tiles_to_read
+from tilestream.pipeline.jobs.rounds import first_round
 from tilestream.pipeline.jobs.run_before import update_of
 from tilestream.pipeline.jobs.run_inputs import (
     Inputs,
@@ -68,14 +69,16 @@ def forecast(settings: RunSettings) -> Forecast:
     map_plan, reading, notes, sources = _expected_map(settings, inputs)
     inputs = with_logs(settings, inputs, sources)
     measure = plan_measure(settings, inputs, map_plan)
-    done = [Outcome(task.key, task.stage) for task in measure.tasks]
     by = estimator_of(settings, sum(task.work for task in measure.outputs("label")))
+    rounds, measure = first_round(settings, map_plan, measure, by)
+    done = [Outcome(task.key, task.stage) for task in measure.tasks]
     estimate = plan_estimate(settings, map_plan.store.grid, measure, done, by)
     tasks = (*reading, *measure.tasks, *estimate.tasks)
     far = {"routes": off_map(map_plan.points, map_plan.store.grid, inputs.routes)}
     lost = [f"{name} is left out: {reason}" for name, reason in measure.left_out.items()]
     few = [by.few] if by.few else []
-    own = {PLAN: [*few, *lost], MATCHER: settings.label.registration.notes}
+    coarse = [] if rounds is None else [rounds.forecast]
+    own = {PLAN: [*few, *lost, *coarse], MATCHER: settings.label.registration.notes}
     return Forecast(
         tasks, noticed(notes, inputs.notes, far, own), _update(settings, map_plan, tasks)
     )

@@ -252,6 +252,7 @@ def _facts(
         "sensor": settings.vehicle.name,
         "labelled places": 0 if known is None else len(known),
         "model": model,
+        **({"coarse": book.facts["coarse"]} if "coarse" in book.facts else {}),
         "matcher": {
             "name": settings.label.registration.told,
             **settings.label.registration.model_dump(),

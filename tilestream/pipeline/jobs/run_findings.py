@@ -8,9 +8,10 @@ import numpy as np
 import pandas as pd
 
 from tilestream.errors import ModelError
-from tilestream.factors.along_route import WIDTH
+from tilestream.factors.along_route import AVERAGED, WIDTH
 from tilestream.factors.heights import note_of_drive, notes_of_routes
 from tilestream.factors.scan_at import scan_at
+from tilestream.factors.stations import INTERPOLATED
 from tilestream.from_above import FromAbove, seen_from_above
 from tilestream.grid import MM_PER_M, Box, TileKey
 from tilestream.model.covariance import COVARIANCE_COLUMNS
@@ -110,6 +111,8 @@ def places_of(done: Done) -> pd.DataFrame:
     joined.loc[lost, "status"] = "failed"
     joined.loc[lost, "reason"] = "no estimate: its task failed, see run.json"
     dtypes = {c.name: c.dtype for c in columns if c.dtype == "float64"}
+    between = joined["status"] == INTERPOLATED  # their kernels are not whole
+    joined.loc[between, [name for name in AVERAGED if name in joined]] = np.nan
     return joined.astype(dtypes)
 
 
@@ -266,7 +269,8 @@ def findings_of(
         otherwise,
         (model.offset or 0.0) if estimator.untrained else None,
     )
-    worth = _worth(done, settings, estimator, (places, labels, tables["protocols"]))
+    coarse = str(facts.get("coarse", {}).get("told", ""))
+    worth = _worth(done, settings, estimator, (places, labels, tables["protocols"]), coarse)
     own = labels if labels.empty else labels[~labels["group"].isin(list(otherwise))]
     places = with_measured(places, own, 0.5 * settings.spacing + ROUNDING)
     gathered = Findings(
@@ -330,8 +334,11 @@ def _worth(
     settings: RunSettings,
     estimator: Estimator,
     tables: tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame],
+    coarse: str,
 ) -> Worth:
-    """What the estimates are worth, from places, labels and the figures by protocol."""
+    """What the estimates are worth, from places, labels, the figures by protocol, and what a coarse
+    run tells of itself.
+    """
     places, labels, protocols = tables
     model, own = None, settings.model.recipe
     if estimator.use is not None:
@@ -359,6 +366,7 @@ def _worth(
         simulated=settings.simulate is not None,
         shipped=estimator.use == SHIPPED,
         few=estimator.few,
+        coarse=coarse,
     )
 
 

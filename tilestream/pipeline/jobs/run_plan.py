@@ -1,16 +1,14 @@
 """What the main job runs: tiles, factors and errors; then what is learnt of them."""
 
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 from tilestream.errors import SourceError, SourceNotFoundError, TileNotReadyError
 from tilestream.factors import catalogue
-from tilestream.factors.along_route import REACH
 from tilestream.factors.own import own_factors
 from tilestream.from_above import tiles_around
-from tilestream.grid import MM_PER_M, TileGrid, TileKey
+from tilestream.grid import TileGrid, TileKey
 from tilestream.model.baselines import Median
 from tilestream.model.dataset import TARGETS, WITHOUT_DRIVES
 from tilestream.model.evaluation import factor_sets
@@ -25,6 +23,7 @@ from tilestream.pipeline.engine.stage import Readable, Task
 from tilestream.pipeline.jobs.along_routes import plan_factors, plan_observe, samples_along
 from tilestream.pipeline.jobs.estimator import Estimator, estimator_of
 from tilestream.pipeline.jobs.localize import labelled_places, plan_localize
+from tilestream.pipeline.jobs.prediction_tasks import model_there, prediction_tasks, products
 from tilestream.pipeline.jobs.run_inputs import (
     Inputs,
     making_of,
@@ -34,15 +33,15 @@ from tilestream.pipeline.jobs.run_inputs import (
 )
 from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.jobs.sources import scans_of
+from tilestream.pipeline.stages.between import Between
 from tilestream.pipeline.stages.evaluate import evaluate
 from tilestream.pipeline.stages.factors import Looking, factors_drive
 from tilestream.pipeline.stages.importance import importance
 from tilestream.pipeline.stages.label import label
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.observe import observe_drive
-from tilestream.pipeline.stages.predict import predict
 from tilestream.pipeline.stages.samples import COLUMNS, DatasetFile, PlacesOf, samples
-from tilestream.pipeline.stages.train import ModelFile, ModelInUse, train
+from tilestream.pipeline.stages.train import ModelFile, train
 from tilestream.report.data import BESIDE
 from tilestream.settings import DriveSettings
 
@@ -51,12 +50,11 @@ OF_DRIVES = (factors_drive.name, observe_drive.name)
 OPPONENT = Median.name
 """What the estimates of a part of the error are compared with: the others know no more of unseen
 paths."""
-NEIGHBOURS_MM = round(REACH * MM_PER_M) + 1
-"""How far from a tile a sample point of it may have neighbours, rounding included [mm]."""
 
 
 def plan_measure(settings: RunSettings, inputs: Inputs, map_plan: MapPlan) -> Plan:
-    """Factors and errors: every task needs only the tiles around it.
+    """Factors and errors: every task needs only the tiles around it. The virtual drives of a coarse
+    run are planned in rounds (`Rounds`).
 
     Args:
         settings: the job.
@@ -78,7 +76,7 @@ def plan_measure(settings: RunSettings, inputs: Inputs, map_plan: MapPlan) -> Pl
     good = [drive for drive in inputs.drives if drive.group in localized]
     own = own_factors(settings.factors)
     plans = [plan_factors(map_plan, places, tables, looking_of(settings), memory, own=own)]
-    if settings.observe is not None:
+    if settings.observe is not None and settings.coarse is None:
         observing = observing_of(settings, settings.observe)
         plans.append(plan_observe(map_plan, places, tables, observing, memory))
     plans += _plans_of_drives(settings, good, map_plan)
@@ -166,6 +164,7 @@ def plan_estimate(
     measure: Plan,
     outcomes: Sequence[Outcome],
     estimator: Estimator | None = None,
+    between: Mapping[TileKey, Between] | None = None,
 ) -> Plan:
     """Samples, evaluate, train, predict: from what was measured.
 
@@ -179,18 +178,19 @@ def plan_estimate(
         measure: what measures.
         outcomes: what became of it.
         estimator: what makes the estimates; None: by how many places were measured.
+        between: by tile, where a coarse run interpolates.
     """
     done = {outcome.key for outcome in outcomes if outcome.ok}
     factors, observed, labels = (
         [task for task in measure.outputs(stage) if task.key in done]
         for stage in ("factors", "observe", "label")
     )
-    if settings.observe is not None:
-        seen = {task.tile for task in observed}
-        factors = [task for task in factors if task.tile in seen]
+    blind = {task.tile for task in measure.outputs("observe") if task.key not in done}
+    factors = [task for task in factors if task.tile not in blind]
     tasks: list[Task] = []
     estimator = estimator or estimator_of(settings, sum(task.work for task in labels))
-    known, model = not estimator.trained, _model_there(estimator)
+    known = not estimator.trained
+    model: Readable | None = model_there(estimator)
     if labels and factors:
         of_drives = [task for task in measure.tasks if task.stage in OF_DRIVES and task.key in done]
         joined = _samples(settings, factors, of_drives, labels)
@@ -201,13 +201,8 @@ def plan_estimate(
             tasks += [training, *_evaluations(settings, joined, bool(observed))]
             tasks.append(_importance(settings, joined, training))
     if known:
-        tasks += _predictions(settings, grid, factors, observed, model)
+        tasks += prediction_tasks(settings, grid, factors, observed, model, between)
     return Plan.of(tasks, settings.memory)
-
-
-def _model_there(estimator: Estimator) -> Readable | None:
-    """The model in use; None: none is there."""
-    return None if estimator.use is None else ModelInUse.of(estimator.use)
 
 
 def _samples(
@@ -238,7 +233,7 @@ def _samples(
             "making": making_of(settings),
         },
         reads={"routes": tuple(PlacesOf(t.product, t.takes["samples"]) for t in routes)}
-        | {name: _products(tasks) for name, tasks in parts.items()},
+        | {name: products(tasks) for name, tasks in parts.items()},
         work=sum(task.work for task in labels),
         counts={"places": sum(task.work for task in (*routes, *of_drives, *labels))},
     )
@@ -249,10 +244,6 @@ def _group(task: Task) -> str:
     assert isinstance(task.writes, Parquet)
     parts = task.writes.path.split("/")
     return parts[-2] if task.stage == label.name else parts[-3]
-
-
-def _products(tasks: Iterable[Task]) -> tuple[Readable, ...]:
-    return tuple(task.product for task in tasks)
 
 
 def _training(settings: RunSettings, joined: Task) -> Task:
@@ -308,42 +299,3 @@ def _importance(settings: RunSettings, joined: Task, training: Task) -> Task:
         reads={"dataset": joined.product, "model": training.product},
         counts=joined.counts,
     )
-
-
-def _predictions(
-    settings: RunSettings,
-    grid: TileGrid,
-    factors: Sequence[Task],
-    observed: Sequence[Task],
-    model: Readable | None,
-) -> list[Task]:
-    """A task per tile, which reads the observability of the neighbours of its sample points too."""
-    of_tile = {task.tile: task for task in observed}
-    making = making_of(settings)
-    reads: dict[str, Any] = {} if model is None else {"model": model}
-    tasks = []
-    for task in factors:
-        assert task.tile is not None
-        near = [of_tile[key] for key in _around(grid, task.tile) if key in of_tile]
-        tasks.append(
-            Task(
-                predict,
-                str(task.tile),
-                Parquet(f"{settings.out}/tables/predictions/{task.tile}.parquet"),
-                takes={
-                    "making": making,
-                    "offset": settings.model.offset or 0.0,
-                    "prediction_error": settings.prediction_error,
-                },
-                reads={**reads, "factors": task.product, "observed": _products(near)},
-                work=task.work,
-                counts={"places": sum(one.work for one in (task, *near))},
-                tile=task.tile,
-            )
-        )
-    return tasks
-
-
-def _around(grid: TileGrid, tile: TileKey) -> Iterable[TileKey]:
-    """The tiles whose sample points may be neighbours of a tile's."""
-    return grid.keys_over(grid.core(tile).grown(NEIGHBOURS_MM))

@@ -18,6 +18,7 @@ from tilestream.model.registry import DEFAULT, OF_VIRTUAL_DRIVES, REGRESSORS, UN
 from tilestream.model.shipped import SHIPPED
 from tilestream.settings import (
     NAME,
+    CoarseSettings,
     DriveSettings,
     LabelSettings,
     LocalFile,
@@ -111,6 +112,9 @@ class RunSettings(PlaceSettings):
     observe: VirtualSettings | None = VirtualSettings()
     """How the vehicle's lidar sees in the virtual drive: usable range, blind sector, starts; null:
     no virtual drive, the paper's factors and their twins only."""
+    coarse: CoarseSettings | None = None
+    """Evaluate some places first, and others only where errors are high or change fast; null: all.
+    With a model in use, or the virtual drive as it is."""
     label: LabelSettings = LabelSettings()
     """How errors are measured."""
     model: ModelSettings = ModelSettings()
@@ -177,6 +181,14 @@ class RunSettings(PlaceSettings):
             raise ValueError(
                 f"has observe.range_max (--range-max) {reach:g} m, and {self.vehicle.name} sees "
                 f"{self.vehicle.range_max:g} m: give no more than that"
+            )
+        learns = self.drives or self.simulate
+        as_it_is = recipe == UNTRAINED and not (learns and self.model.offset is None)
+        if self.coarse is not None and (self.observe is None or not (use or as_it_is)):
+            raise ValueError(
+                "has coarse (--coarse), which chooses among virtual drives by what a model says of "
+                "them: give observe and model.use, e.g. shipped, or model.recipe "
+                f"{UNTRAINED} without drives"
             )
         if recipe == UNTRAINED and use:
             raise ValueError(f"has model.recipe {UNTRAINED} and model.use: give one of them")

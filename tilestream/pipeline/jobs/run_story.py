@@ -20,6 +20,7 @@ from tilestream.pipeline.jobs.estimator import LABELS, Estimator, estimator_of
 from tilestream.pipeline.jobs.inventory import announce, withdraw
 from tilestream.pipeline.jobs.map_reading import GONE, Reading
 from tilestream.pipeline.jobs.map_update import Update
+from tilestream.pipeline.jobs.rounds import Rounds, first_round, remove_rounds
 from tilestream.pipeline.jobs.run_before import keep_before, update_of
 from tilestream.pipeline.jobs.run_book import Book
 from tilestream.pipeline.jobs.run_inputs import Inputs, read_map
@@ -61,6 +62,8 @@ class Story:
         """What is new in it since the last report, by then; None: nothing, or none was there."""
         self.large: Plan | None = None
         """What is left to be run by all workers together, when all else is done."""
+        self.rounds: Rounds | None = None
+        """Those of a coarse run; None: all places are evaluated."""
         self._tiles: set[str] = set()
         self._open: set[str] = set()
         self._early = _Early((), set())
@@ -114,7 +117,7 @@ class Story:
             early = self._early.after(outcome)
             self._given |= {task.key for task in early}
             return self._known(early)
-        return self._known(self._estimated())
+        return self._known(self._next_round() or self._estimated())
 
     def ahead(self) -> tuple[Task, ...] | None:
         """What is expected to follow what is measured; None: that is not known yet."""
@@ -122,6 +125,19 @@ class Story:
             with suppress(PlanError):  # raised when it comes to that, if it does
                 self._ahead = self._expected().tasks
         return self._ahead
+
+    def _next_round(self) -> tuple[Task, ...]:
+        """What a coarse run does next; nothing: all that is to be evaluated is."""
+        if self.rounds is None:
+            return ()
+        more = self.rounds.after({outcome.key for outcome in self.book.outcomes if outcome.ok})
+        self.measure = replace(self.measure, tasks=(*self.measure.tasks, *more))
+        self._open = {task.key for task in more}
+        announce(more)
+        if not more:
+            self.rounds.remove_others()
+            self.book.facts["coarse"] = self.rounds.told.plain()
+        return more
 
     def _estimated(self) -> tuple[Task, ...]:
         """What is to be done when all is measured."""
@@ -161,8 +177,10 @@ class Story:
 
     def _plan(self, outcomes: Sequence[Outcome]) -> Plan:
         """What is learnt and estimated from what was measured."""
-        grid = self.store.grid
-        return plan_estimate(self.settings, grid, self.measure, outcomes, self.estimator)
+        between = None if self.rounds is None else self.rounds.between()
+        return plan_estimate(
+            self.settings, self.store.grid, self.measure, outcomes, self.estimator, between
+        )
 
     def _close_map(self) -> None:
         """Record what the map was made from, as soon as its last tile is written."""
@@ -178,6 +196,11 @@ class Story:
             keep_before(self.settings)
         self.measure = plan_measure(self.settings, self.inputs, map_plan)
         self.book.failures |= self.measure.left_out
+        labelled = sum(task.work for task in self.measure.outputs("label"))
+        self.estimator = estimator_of(self.settings, labelled)
+        self.rounds, self.measure = first_round(
+            self.settings, map_plan, self.measure, self.estimator
+        )
         announce(self.measure.tasks)
         _remove_other_groups(self.settings, self.measure)
         self._open = {task.key for task in self.measure.tasks}
@@ -186,9 +209,7 @@ class Story:
 
     def _first_estimates(self) -> "_Early":
         """The estimates that need not wait for all that is measured."""
-        labelled = sum(task.work for task in self.measure.outputs("label"))
-        self.estimator = estimator_of(self.settings, labelled)
-        if self.estimator.trained:
+        if self.estimator.trained or self.rounds is not None:
             return _Early((), set())
         tasks = self._expected().outputs("predict")
         announce(tasks)
@@ -230,6 +251,8 @@ def _remove_other_groups(settings: RunSettings, measure: Plan) -> None:
     Those of a drive whose log cannot be read now are kept: they were hours of work, maybe.
     """
     kept = {name.removeprefix("drive ") for name in measure.left_out}
+    if settings.coarse is None:
+        remove_rounds(settings.out)
     own = {path.rsplit("/", 1)[0] for path in paths_of(measure.tasks)}
     for kind, below in (
         ("errors", ""),

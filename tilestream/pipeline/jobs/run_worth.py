@@ -40,6 +40,7 @@ def worth_of(
     simulated: bool = False,
     shipped: bool = False,
     few: str = "",
+    coarse: str = "",
 ) -> Worth:
     """What the estimates of a run are worth.
 
@@ -53,6 +54,7 @@ def worth_of(
         simulated: whether city and drives of the run are simulated.
         shipped: whether it came with tilestream.
         few: why nothing was trained here, where something was to be.
+        coarse: of a coarse run, how many places are interpolated, and how far off.
     """
     estimate = estimates(places)
     at = _median_place(estimate)
@@ -70,13 +72,20 @@ def worth_of(
         **_ends(places, at),
         outside=int((like == "no").sum()) / compared if compared else None,
         **trained,
-        warnings=(*([few] if few else []), *_small(trained)),
+        warnings=(*([few] if few else []), *([coarse] if coarse else []), *_small(trained)),
     )
 
 
 def _ends(places: pd.DataFrame, at: int | None) -> dict[str, Any]:
-    """`low` and `high` of a place [m]."""
-    return {} if at is None else {name: _number(places[name].iloc[at]) for name in ("low", "high")}
+    """`low` and `high` of a place [m]; of one that has none, as it is interpolated, those of the
+    nearest estimate that has them.
+    """
+    if at is None:
+        return {}
+    estimate, has = estimates(places), np.flatnonzero(places["low"].notna())
+    if has.size:
+        at = int(has[np.argmin(np.abs(estimate[has] - estimate[at]))])
+    return {name: _number(places[name].iloc[at]) for name in ("low", "high")}
 
 
 def _median_place(estimate: Any) -> int | None:

@@ -55,7 +55,7 @@ class Observing:
 
 @stage(
     "observe",
-    version=7,
+    version=8,
     memory=lambda counts: (
         FIXED_BYTES + (BYTES_PER_POINT + BYTES_PER_DRAW * counts["draws"]) * counts["points"]
     ),
@@ -100,6 +100,7 @@ def observe_task(
     folder: str,
     group: str = "",
     applies: Stage = observe,
+    below: str = "",
 ) -> Task:
     """The observability of the sample points of a tile, from surfels and cells of those in sight.
 
@@ -111,6 +112,7 @@ def observe_task(
         folder: of the tables.
         group: of which drive, or as whose sensor, where one plan has several.
         applies: `observe`, or `observe_drive`.
+        below: a folder in that of these tables, of which several plans write a part; with `/`.
     """
     cell_mm = whole_mm(observing.cell_size, "cell_size")
     seen = plan.over(Box.around(samples.places, observing.reach + MARGIN))
@@ -118,7 +120,7 @@ def observe_task(
     return Task(
         applies,
         "-".join(part for part in (group, str(tile)) if part),
-        Parquet(f"{folder}/observability/{tile}.parquet"),
+        Parquet(f"{folder}/observability/{below}{tile}.parquet"),
         takes={"samples": samples, "observing": observing},
         reads={"map_part": plan.part(seen, made)},
         work=len(samples),

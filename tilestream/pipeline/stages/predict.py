@@ -15,6 +15,7 @@ from tilestream.model.training import ESTIMATES, PREDICTION_COLUMNS, Model
 from tilestream.model.training import predict as predicted
 from tilestream.pipeline.engine.outputs import Stored
 from tilestream.pipeline.engine.stage import stage
+from tilestream.pipeline.stages.between import Between
 from tilestream.pipeline.stages.samples import BYTES_PER_ROW, places_with_factors
 
 LARGE_ERROR = 0.10
@@ -38,6 +39,7 @@ def predict(
     offset: float,
     prediction_error: float,
     model: Model | None = None,
+    between: Between | None = None,
 ) -> pd.DataFrame:
     """The estimates of sample points, a row each.
 
@@ -50,11 +52,43 @@ def predict(
         prediction_error: how far off a filter's prediction is from which a registration starts,
             standard deviation in map x and in y [m].
         model: None: the virtual drive as it is.
+        between: where places are interpolated, whatever was observed of them; None: nowhere.
     """
     places = places_with_factors([factors], observed, WIDTH if model is None else model.width)
-    found = physical(places, offset) if model is None else predicted(model, places, making)
-    covariance = covariances(places, observed, prediction_error, model)
-    return pd.concat([places[[c.name for c in PLACE_COLUMNS]], found, covariance], axis=1)
+
+    def evaluated(own: pd.DataFrame) -> pd.DataFrame:
+        found = physical(own, offset) if model is None else predicted(model, own, making)
+        return pd.concat([found, covariances(own, observed, prediction_error, model)], axis=1)
+
+    if between is None:
+        found = evaluated(places)
+    else:
+        found = between.filled(places, (factors.rows["status"] == "done").to_numpy(), evaluated)
+    return pd.concat([places[[c.name for c in PLACE_COLUMNS]], found], axis=1)
+
+
+@stage(
+    "stations",
+    version=predict.version,
+    memory=predict.memory,
+    seconds=predict.seconds,
+    columns=predict.columns,
+)
+def stations(
+    factors: Stored,
+    observed: Sequence[Stored],
+    making: dict[str, Any],
+    offset: float,
+    prediction_error: float,
+    model: Model | None = None,
+) -> pd.DataFrame:
+    """The same after a round of a coarse run: right where the kernels of places are whole, which
+    decides where others are evaluated.
+    """
+    made: pd.DataFrame = predict.function(
+        factors, observed, making, offset, prediction_error, model
+    )
+    return made
 
 
 def covariances(

@@ -11,7 +11,7 @@ import pandas as pd
 from tilestream.errors import CorruptSourceError, SourceNotFoundError, foreign_errors
 from tilestream.files import Files
 from tilestream.formats.routes import with_tags
-from tilestream.report.data import LaneletMap, estimates, like_training
+from tilestream.report.data import LaneletMap, estimates, interpolated, like_training
 from tilestream.report.measured import measure_of
 from tilestream.report.summary import by_reason
 
@@ -31,9 +31,10 @@ def write_lanelets(file: Files, source: LaneletMap, places: pd.DataFrame) -> dic
     their estimates, `tilestream:error_max`, the highest, and `tilestream:measured`, the largest
     measured error (all in metres), `tilestream:p_fail`, the highest estimated share of starts that
     fail, `tilestream:in_domain`, whether all are like the training places (`yes` or `no`),
-    `tilestream:places`, how many they are, and `tilestream:missing`, how many of them have no
-    estimate. What is not known has no tag; a lanelet without any estimate has the reason in
-    `tilestream:reason`. Lanelets that are not for vehicles, or whose bounds are broken, have none.
+    `tilestream:places`, how many they are, `tilestream:missing`, how many of them have no
+    estimate, and `tilestream:interpolated`, how many were not evaluated. What is not known has no
+    tag; a lanelet without any estimate has the reason in `tilestream:reason`. Lanelets that are not
+    for vehicles, or whose bounds are broken, have none.
 
     Args:
         file: where to.
@@ -79,8 +80,10 @@ def _told(places: pd.DataFrame) -> dict[str, str]:
     if not known.any():
         reason = next(iter(by_reason(places["reason"])))
         return {"reason": shorten(reason, LONGEST, placeholder=" …"), **driven, **counts}
-    like = like_training(places[known])
-    domain = {} if (like == "not known").any() else {"in_domain": "no" if "no" in like else "yes"}
+    between = interpolated(places)
+    like = set(like_training(places[known & ~between]))
+    told = like and "not known" not in like
+    domain = {"in_domain": "no" if "no" in like else "yes"} if told else {}
     fail = places["p_fail"].max()
     return {
         "error": f"{estimate[known].mean():.3f}",
@@ -90,4 +93,5 @@ def _told(places: pd.DataFrame) -> dict[str, str]:
         **domain,
         **counts,
         **({} if known.all() else {"missing": str(int((~known).sum()))}),
+        **({"interpolated": str(int(between.sum()))} if between.any() else {}),
     }

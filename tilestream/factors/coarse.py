@@ -1,0 +1,219 @@
+"""Coarse first, over all routes: what is evaluated so far, what is evaluated next, and how often
+what is interpolated is off (definitions, section 4.6).
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import binomtest
+
+from tilestream.factors.stations import (
+    first_stations,
+    gaps,
+    halved,
+    known,
+    numbers,
+    probes,
+    support,
+)
+from tilestream.records import Float64, Int64
+from tilestream.settings import CoarseSettings
+
+CHECKED_OF = 50
+"""One of so many interpolated places is checked, at most: each takes a whole kernel of places."""
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a coarse run did, and how far its interpolated places can be trusted."""
+
+    every: int
+    """First about one place in so many was evaluated."""
+    tolerance: float
+    """How far off an interpolated estimate may be [m]."""
+    places: int
+    """All sample points."""
+    first: int
+    """Virtual drives of the first round."""
+    evaluated: int
+    """Virtual drives of all rounds."""
+    interpolated: int
+    """Places that are interpolated."""
+    rounds: int
+    """How many rounds there were."""
+    checked: int
+    """Interpolated places, chosen by lot, that were evaluated after all …"""
+    off: int
+    """… of which so many were farther off than the tolerance, or had no estimate."""
+    off_share: float | None
+    """Share of these; None: none was checked …"""
+    off_low: float | None
+    """… and the ends of its 95 % interval (Wilson)."""
+    off_high: float | None
+    """See `off_low`."""
+
+    @property
+    def words(self) -> str:
+        """The same as sentences."""
+        n = self.interpolated
+        said = f"{self.evaluated:,} virtual drives were taken for {self.places:,} places"
+        if not n:
+            return f"{said}: none is interpolated."
+        said += f"; {n:,} places are not evaluated but interpolated along their route. "
+        if self.off_share is None:
+            return f"{said}None of them was checked: how often they are off is not known."
+        centimetres = f"{100.0 * self.tolerance:g} cm"
+        return (
+            f"{said}Of {self.checked:,} such places that were checked by lot {self.off:,} were off "
+            f"by more than {centimetres}: {self.off_share:.0%} ({self.off_low:.0%} to "
+            f"{self.off_high:.0%})."
+        )
+
+    def plain(self) -> dict[str, object]:
+        """The fields, and `told`: the same in words."""
+        return {**asdict(self), "told": self.words}
+
+
+class Coarse:
+    """What is known of the places of all routes, which are numbered one route after the other."""
+
+    def __init__(self, routes: Mapping[str, int], half: int, settings: CoarseSettings) -> None:
+        """Before anything is evaluated.
+
+        Args:
+            routes: how many places each route has.
+            half: places to each side that a kernel reaches (`half_support`).
+            settings: what decides.
+        """
+        self._routes, self._half, self._settings = dict(routes), half, settings
+        total = sum(self._routes.values())
+        self._taken = np.zeros(total, bool)
+        self._lost = np.zeros(total, bool)
+        self._estimate = np.full(total, np.nan)
+        self._checked: Int64 | None = None
+        self._said = np.zeros(0)  # of the checked places, before they were evaluated [m]
+        self._off = 0
+        self._first = self._rounds = 0
+
+    def next(self) -> Int64:
+        """The places to evaluate next; none: the rest is interpolated.
+
+        When nothing is left to halve, some interpolated places are chosen by lot; what these show
+        may ask for more.
+        """
+        if not self._rounds:
+            wanted = self._begun()
+            self._first = len(wanted)
+        else:
+            self._check()
+            coarse = self._settings
+            wanted = self._supports(
+                halved(self.gaps, self._estimate, coarse.tolerance, coarse.high)
+            )
+            if not wanted.size and self._checked is None:
+                wanted = self._supports(self._lots())
+        self._rounds += bool(wanted.size)
+        self._taken[wanted] = True
+        return wanted
+
+    def learn(self, estimate: Float64) -> None:
+        """What the estimates are now.
+
+        Args:
+            estimate: (n,) of all places [m]; NaN where there is none.
+        """
+        self._estimate = np.where(self._taken & ~self._lost, estimate, np.nan)
+
+    def lose(self, places: Int64) -> None:
+        """Of these places nothing can be known."""
+        self._lost[places] = self._taken[places] = True
+
+    @property
+    def gaps(self) -> Int64:
+        """(k, 2) the known places between which all others lie, each pair of one route."""
+        done = np.isfinite(self._estimate)
+        found = [np.zeros((0, 2), np.int64)]
+        for _, begin, count in self._parts():
+            part = slice(begin, begin + count)
+            found.append(begin + gaps(known(self._taken[part], done[part], self._half)))
+        return np.concatenate(found)
+
+    @property
+    def interpolated(self) -> Int64:
+        """The places in the gaps."""
+        inside = [np.arange(a + 1, b) for a, b in self.gaps.tolist()]
+        return np.concatenate([*inside, np.zeros(0, np.int64)])
+
+    def told(self) -> Told:
+        """What was done, and how often what is interpolated is off."""
+        count = 0 if self._checked is None else len(self._checked)
+        share = low = high = None
+        if count:
+            interval = binomtest(self._off, count).proportion_ci(0.95, method="wilson")
+            share, low, high = self._off / count, float(interval.low), float(interval.high)
+        return Told(
+            self._settings.every,
+            self._settings.tolerance,
+            len(self._taken),
+            self._first,
+            int((self._taken & ~self._lost).sum()),
+            len(self.interpolated),
+            self._rounds,
+            count,
+            self._off,
+            share,
+            low,
+            high,
+        )
+
+    def _parts(self) -> Iterator[tuple[str, int, int]]:
+        """Name, first place and number of places of each route."""
+        begin = 0
+        for name, count in self._routes.items():
+            yield name, begin, count
+            begin += count
+
+    def _begun(self) -> Int64:
+        """The places of the first round."""
+        every, half = self._settings.every, self._half
+        stations, between = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+        for _, begin, count in self._parts():
+            of_route = first_stations(count, half, every)
+            stations.append(begin + of_route)
+            between.append(begin + probes(of_route, half, every))
+        return np.union1d(self._supports(np.concatenate(stations)), np.concatenate(between))
+
+    def _supports(self, stations: Int64) -> Int64:
+        """The places that stations need and that are not taken."""
+        wanted = np.zeros(len(self._taken), bool)
+        for _, begin, count in self._parts():
+            own = stations[(stations >= begin) & (stations < begin + count)] - begin
+            part = slice(begin, begin + count)
+            wanted[part] = support(own, self._taken[part], self._half)
+        return np.flatnonzero(wanted)
+
+    def _lots(self) -> Int64:
+        """The interpolated places that are checked."""
+        inside = self.interpolated
+        drawn: NDArray[np.uint64] = np.concatenate(
+            [
+                numbers(name, np.arange(count), self._settings.seed)
+                for name, _, count in self._parts()
+            ]
+        )
+        count = min(self._settings.checks, -(-len(inside) // CHECKED_OF))
+        self._checked = np.sort(inside[np.argsort(drawn[inside], kind="stable")[:count]])
+        if count:
+            ends = np.unique(self.gaps)
+            self._said = np.interp(self._checked, ends, self._estimate[ends])
+        return self._checked
+
+    def _check(self) -> None:
+        """Compare the checked places, once they are evaluated."""
+        if self._checked is None or not self._said.size:
+            return
+        said, self._said = self._said, np.zeros(0)
+        close = np.abs(said - self._estimate[self._checked]) <= self._settings.tolerance
+        self._off = int((~close).sum())
