@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tilestream.factors.along_route import AVERAGED, CUT, REACH, WIDTHS, averaged_along
-from tilestream.pipeline.jobs.run_plan import NEIGHBOURS_MM
+from tilestream.pipeline.jobs.prediction_tasks import NEIGHBOURS_MM
 
 KERNELS = st.sampled_from([width for width in WIDTHS if width])
 

@@ -15,7 +15,8 @@ from tilestream.report.summary import headline
 
 def places(count: int = 20) -> pd.DataFrame:
     estimates = {name: np.linspace(0.02, 0.04, count) for name in ESTIMATES.values()}
-    return pd.DataFrame({"route_id": "a", "arc_length": np.arange(count, dtype=float), **estimates})
+    own = {"route_id": "a", "arc_length": np.arange(count, dtype=float), "status": "done"}
+    return pd.DataFrame(own | estimates)
 
 
 def labels(group: str, path: str, arc: list[float], error: list[float]) -> pd.DataFrame:

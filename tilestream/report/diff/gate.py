@@ -103,7 +103,9 @@ def diff_gate(
     check_threshold(limit, "fail_worse")
     before, after = found.places.estimates(measure)
     growth = after - before
-    judged = found.places.places[["route_id", "arc_length"]].assign(error=growth, measured=False)
+    judged = found.places.places[["route_id", "arc_length"]].assign(
+        error=growth, measured=False, interpolated=False
+    )
     judged = judged[np.isfinite(growth)]
     closed: list[str] = []
     if over == "segments" and len(judged):
