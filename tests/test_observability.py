@@ -17,7 +17,7 @@ from tilestream.factors.observability import (
     COLUMNS,
     observability,
 )
-from tilestream.factors.surfels import in_view, surfels_in
+from tilestream.factors.surfels import Surfels, can_be_met, in_view, surfels_in
 from tilestream.factors.virtual_drive import (
     AXES,
     MOMENT_COLUMNS,
@@ -411,3 +411,23 @@ def test_what_cannot_be_is_refused(store: ts.TileStore) -> None:
         VirtualSettings(draws=2, worlds=3)
     with pytest.raises(UsageError, match="did you mean range_max"):
         VirtualSettings(range_maxx=3.0)  # type: ignore[call-arg]
+
+
+@pytest.mark.parametrize("fov_deg", [(-25.0, 3.0), (-15.0, 15.0), (2.0, 10.0), (-90.0, 90.0)])
+def test_what_can_be_met_is_the_field_of_view_and_a_metre_more(
+    fov_deg: tuple[float, float],
+) -> None:
+    rng = np.random.default_rng(5)
+    centre = rng.integers(-40_000, 40_000, (4000, 3))
+    places = rng.uniform(-3.0, 3.0, (5, 3))
+    none = np.zeros(len(centre), np.bool_)
+    surfels = Surfels(centre, np.zeros((len(centre), 3), np.int16), np.ones(len(centre), int), none)
+    met = can_be_met(surfels, places, fov_deg, 20.0, 0.5)
+    offset = centre[:, None] / 1000.0 - places  # (n, places, 3)
+    away = np.linalg.norm(offset[..., :2], axis=2)
+    low, high = np.tan(np.radians(np.clip(fov_deg, -89.0, 89.0)))
+    inside = (away <= 20.0) & (offset[..., 2] >= low * away) & (offset[..., 2] <= high * away)
+    assert met[inside.any(axis=1)].all()
+    spread = 2.0 * float(np.abs(places).max()) + 2.0
+    assert not met[away.min(axis=1) > 20.0 + 2.0 * spread].any()
+    assert 0 < met.sum() < len(met)

@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 
 from tilestream.factors.ghosts import REACH_EDGES as GHOST_EDGES
 from tilestream.factors.ghosts import ghosts_among
-from tilestream.grid import MM_PER_M, Box, TileKey, whole_mm
+from tilestream.grid import Box, TileKey, whole_mm
+from tilestream.kernels import in_view as kernel
 from tilestream.kernels.cells import cell_of_points
+from tilestream.kernels.in_view import Field
 from tilestream.kernels.surfels import NORMAL_ONE, surfels_of
 from tilestream.kernels.thinning import thinned
 from tilestream.records import Float64, Int64
@@ -232,15 +234,11 @@ def can_be_met(
         rim: how far from its place a beam may start [m].
     """
     middle = places.mean(axis=0)
-    around = float(np.hypot(*(places - middle)[:, :2].T).max())
-    offset = surfels.centre_mm / MM_PER_M - middle
-    away = np.hypot(offset[:, 0], offset[:, 1])
-    near, far = np.maximum(away - around - 1.0 - rim, 0.0), away + around + 1.0 + rim
+    around = float(np.hypot(*(places - middle)[:, :2].T).max()) + 1.0 + rim
     low, high = (math.tan(math.radians(min(max(edge, -89.0), 89.0))) for edge in fov_deg)
     up = (places - middle)[:, 2]
-    bottom, top = up.min() - 1.0 - rim, up.max() + 1.0 + rim
-    floor = bottom + low * (far if low < 0.0 else near)
-    ceiling = top + high * (far if high > 0.0 else near)
-    height = offset[:, 2]
-    met: NDArray[np.bool_] = (near <= reach) & (height >= floor) & (height <= ceiling)
+    bottom, top = float(up.min()) - 1.0 - rim, float(up.max()) + 1.0 + rim
+    x, y, z = middle.tolist()
+    field = Field((x, y, z), around, reach, bottom, top, low, high)
+    met: NDArray[np.bool_] = kernel.can_be_met(np.ascontiguousarray(surfels.centre_mm), field)
     return met
