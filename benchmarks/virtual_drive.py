@@ -160,8 +160,32 @@ def cost(folder: Path, spacing: float) -> pd.DataFrame:
         for count in (32, 317):
             starts = partial(ends_of, *at, stratified_starts(count))
             rows.append((f"{count} starts", name, cpu_ms(starts, 4)))
+    rows += place_rows(store, places, heading, seeing)
     table = pd.DataFrame(rows, columns=["step", "of", "ms of one core"])
     return table.round({"ms of one core": 1})
+
+
+def place_rows(
+    store: ts.TileStore, places: Floats, heading: float, seeing: VirtualSettings
+) -> list[tuple[str, str, float]]:
+    """What a place costs with all its draws: its own, and its share of what places near it share.
+
+    The same places given four times share no more than once.
+    """
+
+    def seen(times: int) -> float:
+        where = np.repeat(places, times, axis=0)
+        along = np.full(len(where), heading)
+        matcher = MATCHERS["autoware"]
+        return cpu_ms(lambda: observability(store, where, along, ts.VLP16, seeing, matcher), 2)
+
+    once, four = seen(1), seen(4)
+    own = (four - once) / 3.0
+    draws = f"autoware, {seeing.draws} draws"
+    return [
+        ("a place, its own", draws, own / len(places)),
+        ("what it shares", f"{len(places)} do", (once - own) / len(places)),
+    ]
 
 
 def upright(place_mm: Any, heading: float) -> Floats:
