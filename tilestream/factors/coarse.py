@@ -61,7 +61,8 @@ class Told:
         said = f"{self.evaluated:,} virtual drives were taken for {self.places:,} places"
         if not n:
             return f"{said}: none is interpolated."
-        said += f"; {n:,} places are not evaluated but interpolated along their route. "
+        said += f"; {n:,} others are not evaluated: where they have ground, they are interpolated "
+        said += "along their route. "
         if self.off_share is None:
             return f"{said}None of them was checked: how often they are off is not known."
         centimetres = f"{100.0 * self.tolerance:g} cm"
