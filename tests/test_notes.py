@@ -133,7 +133,8 @@ def test_a_gate_closes_where_most_of_a_drive_was_not_evaluated(
     posed: int, places: int, measured: int, opens: bool
 ) -> None:
     drive = DriveMeasured("d", 200, 100, posed, places, measured, {"not selected": 100})
-    table = pd.DataFrame({"route_id": "a", "arc_length": [0.0, 1.0], "estimate": 0.1})
+    two = {"route_id": "a", "arc_length": [0.0, 1.0], "estimate": 0.1, "status": "done"}
+    table = pd.DataFrame(two)
     why = f"less than 50% was measured of drive d ({measured} of 200 scans)"
     assert gate(table, 0.25, [drive.plain()]) == ([] if opens else [why])
 
@@ -141,7 +142,9 @@ def test_a_gate_closes_where_most_of_a_drive_was_not_evaluated(
 def test_a_gate_closes_where_most_of_a_route_was_not_evaluated() -> None:
     """Also where that is less than 5 % of all places."""
     estimate = [0.1] * 1000 + [0.1] * 4 + [np.nan] * 6
-    places = pd.DataFrame({"route_id": ["a"] * 1000 + ["b"] * 10, "estimate": estimate})
+    status = np.where(np.isnan(estimate), "missing", "done")
+    routes = ["a"] * 1000 + ["b"] * 10
+    places = pd.DataFrame({"route_id": routes, "estimate": estimate, "status": status})
     places["arc_length"] = np.arange(1010.0)
     assert gate(places, 0.25) == ["less than 50% of the places have an estimate on b (40%)"]
     places.loc[1004, "estimate"] = 0.1

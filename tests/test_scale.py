@@ -152,6 +152,6 @@ def test_a_hundred_thousand_tasks_are_little_memory_and_time(tmp_path: Path) -> 
     script.write_text(MEMORY.format(tests=str(Path(__file__).parent)))
     told = subprocess.run([sys.executable, script], check=True, capture_output=True, text=True)
     planned, executed, seconds = (float(value) for value in told.stdout.split())
-    assert planned < 120.0, "MB of the tasks themselves"
-    assert executed < 120.0, "MB beyond them"
+    assert planned < 130.0, "MB of the tasks themselves"
+    assert executed < 85.0, "MB beyond them"
     assert seconds < 60.0, "of CPU"
