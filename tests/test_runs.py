@@ -1,5 +1,6 @@
 """A run directory in Python: one table of its places, and a picture."""
 
+import json
 import shutil
 import sys
 from pathlib import Path
@@ -9,16 +10,19 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from hand_made_run import LABELS, PLACES, write_run
+from hand_made_run import LABELS, PLACES, places, write_run
 from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 
 import tilestream as ts
 from tilestream.apps import runs
-from tilestream.apps.runs import with_labels
-from tilestream.errors import IncompleteError, SourceNotFoundError, UsageError
+from tilestream.apps.runs import places_of, with_labels
+from tilestream.errors import DamagedError, IncompleteError, SourceNotFoundError, UsageError
+from tilestream.files import Files
+from tilestream.marks import sealed
 from tilestream.model.join import ON_PATH
+from tilestream.pipeline.jobs.run_book import checksums
 from tilestream.report.colours import FIXED
 
 
@@ -88,6 +92,22 @@ def test_where_geopandas_is_the_places_are_points_in_the_maps_crs(folder: Path) 
     assert table.geometry.x.tolist() == table["x"].tolist()
     assert table.geometry.z.tolist() == table["z"].tolist()
     assert table.crs is None  # of a map without one
+
+
+def test_places_of_a_report_that_are_not_as_they_were_written_are_refused(
+    folder: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(folder, run)
+    whole = pd.concat([places(), pd.DataFrame({"estimate": [0.1] * PLACES})], axis=1)
+    (run / "report").mkdir()
+    whole.to_parquet(run / "report" / "places.parquet")
+    facts = {"state": "done", "files": checksums(Files.at(run))}
+    (run / "run.json").write_text(json.dumps(sealed(facts)))
+    assert places_of(run)["estimate"].tolist() == [0.1] * PLACES
+    whole.assign(estimate=0.0).to_parquet(run / "report" / "places.parquet")
+    with pytest.raises(DamagedError, match="checksum does not fit"):
+        places_of(run)
 
 
 def test_what_is_no_run_or_not_whole_is_refused(folder: Path, tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ from tilestream.model.covariance import COVARIANCE_COLUMNS
 from tilestream.model.join import ON_PATH
 from tilestream.model.training import ESTIMATES, MAIN, PREDICTION_COLUMNS
 from tilestream.notebook import axes_of, html_of
-from tilestream.pipeline.jobs.run_book import ENDED, told_before
+from tilestream.pipeline.jobs.run_book import ENDED, content_as_written, told_before
 from tilestream.pipeline.jobs.run_folder import map_of, rows_of, table_paths
 from tilestream.pipeline.jobs.run_inputs import seen_otherwise
 from tilestream.pipeline.jobs.run_names import RECORD
@@ -43,6 +43,8 @@ from tilestream.report.formatting import CM_PER_M
 from tilestream.store import TileStore
 from tilestream.tables import read_tables
 
+PLACES = "report/places.parquet"
+"""The places of a run that has ended, in its directory."""
 PLACE = [column.name for column in PLACE_COLUMNS]
 ESTIMATED = [column.name for column in (*PREDICTION_COLUMNS, *COVARIANCE_COLUMNS)]
 MEASURED = {
@@ -111,11 +113,14 @@ def crs_of_map(place: str | os.PathLike[str]) -> str | None:
 def places_of(place: str | os.PathLike[str]) -> pd.DataFrame:
     """Every sample point of the routes; of a run that has ended as its report has it, else as far
     as its tables go, each virtual drive of its own place alone.
+
+    Raises:
+        DamagedError: a table, or what the report has, is not what was written.
     """
     folder = Files.at(place)
-    report = folder.under("report/places.parquet")
-    if report.there() and told_before(folder.under(RECORD)).get("state") in ENDED:
-        shown = pd.read_parquet(io.BytesIO(report.read()))
+    report, record = folder.under(PLACES), told_before(folder.under(RECORD))
+    if report.there() and record.get("state") in ENDED:
+        shown = pd.read_parquet(io.BytesIO(content_as_written(report, record, PLACES)))
         return shown.drop(columns=["geometry", *OF_LABEL], errors="ignore")
     tables = [rows_of(place, name) for name in ("factors", "observability", "predictions")]
     found = pd.DataFrame()

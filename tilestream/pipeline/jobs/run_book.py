@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from tilestream.errors import DamagedError
 from tilestream.files import Files
-from tilestream.marks import sealed, unsealed
+from tilestream.marks import AGAIN, sealed, unsealed
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.engine.stage import Task
@@ -146,6 +147,24 @@ def checksums(folder: Files) -> dict[str, str]:
 def checksum_of(file: Files) -> str:
     """The checksum of a file's bytes."""
     return f"{zlib.crc32(file.read()):08x}"
+
+
+def content_as_written(file: Files, record: Mapping[str, Any], name: str) -> bytes:
+    """The bytes of a file of a run directory, as the run wrote it.
+
+    Args:
+        file: the file.
+        record: what the run says of itself (`told_before`).
+        name: its path in the run directory.
+
+    Raises:
+        DamagedError: it is not what was written.
+    """
+    content = file.read()
+    known = record.get("files", {}).get(name)
+    if known is not None and known != f"{zlib.crc32(content):08x}":
+        raise DamagedError(f"{file.address} is damaged, its checksum does not fit: {AGAIN}")
+    return content
 
 
 def write_text(file: Files, text: str) -> None:
