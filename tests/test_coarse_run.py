@@ -14,7 +14,9 @@ from report_findings import without_labels
 from streets import job
 
 import tilestream as ts
+from tilestream.apps.scene import scene_of
 from tilestream.cli import run as command
+from tilestream.cli.viewing import legend
 from tilestream.errors import ModelError, PartialError, UsageError
 from tilestream.factors.stations import INTERPOLATED
 from tilestream.model.covariance import COVARIANCE_COLUMNS
@@ -139,6 +141,11 @@ def test_it_is_told_apart_wherever_it_shows(coarse: Path) -> None:
     assert told["first"] < 0.5 * told["evaluated"]
     assert 0 < told["checked"] <= 4
     assert told["off_low"] <= told["off_share"] == told["off"] / told["checked"] <= told["off_high"]
+    assert 0.0 <= told["off_mean"] <= told["off_most"]
+    assert ts.info(coarse).plain()["coverage"]["places_interpolated"] == between.sum()
+    shown = scene_of(coarse)
+    assert shown.interpolated.sum() == between.sum()
+    assert f"{between.sum():,} of them interpolated" in "".join(map(str, legend(shown)))
     report = json.loads((coarse / "report" / "report.json").read_text())
     assert report["facts"]["coarse"] == told
     assert told["told"] in report["worth"]["told"]
@@ -161,6 +168,7 @@ def test_covariances_are_of_evaluated_places_alone(coarse: Path, tmp_path: Path)
     known = found["cov_along_along"].notna() & (found["status"] == "done")
     assert made["places"] == known.sum()
     assert made["without"] == len(found) - made["places"]
+    assert made["interpolated"] == (found["status"] == INTERPOLATED).sum() > 0
 
 
 @pytest.mark.usefixtures("no_report")

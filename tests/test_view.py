@@ -25,7 +25,7 @@ from tilestream.apps.camera import oblique
 from tilestream.apps.scene import scene_of
 from tilestream.cli import run
 from tilestream.errors import StoreNotFoundError, TileNotReadyError, UsageError
-from tilestream.factors.rows import PLACE_COLUMNS
+from tilestream.factors.rows import PLACE_COLUMNS, STATUS_COLUMNS
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.marks import Mark
 from tilestream.model.training import PREDICTION_COLUMNS
@@ -52,6 +52,7 @@ def write_places(
     path: Path, columns: tuple[Column, ...], x: list[float], store: ts.TileStore, **error: object
 ) -> None:
     rows = pd.DataFrame({"x": x}).add(OFFSET[0]).assign(y=OFFSET[1], z=OFFSET[2] + 2.0, **error)
+    rows = rows.assign(status="done")
     write_table(str(path), rows, columns, Mark("done", facts={"store": store.address}))
 
 
@@ -63,7 +64,8 @@ def run_dir(store: ts.TileStore, tmp_path_factory: pytest.TempPathFactory) -> Pa
     write_places(path, ERROR_COLUMNS, [5, 10, 15], store, error_mean=MEASURED)
     path, columns = tables / "predictions" / "0_0.parquet", (*PLACE_COLUMNS, *PREDICTION_COLUMNS)
     write_places(path, columns, [5.2, 20, 25, 30], store, estimate=ESTIMATED)
-    write_places(tables / "factors" / "0_0.parquet", PLACE_COLUMNS, [20, 35], store)
+    columns = (*PLACE_COLUMNS, *STATUS_COLUMNS)
+    write_places(tables / "factors" / "0_0.parquet", columns, [20, 35], store)
     listed(tables)
     return tables.parent
 
@@ -122,7 +124,7 @@ def test_of_places_upon_each_other_the_worst_measured_is_drawn(
     twice = viewer.Scene(
         store, shown.tiles, shown.total, shown.origin, shown.points,
         np.repeat(shown.places[:1], 4, axis=0), np.array([0.1, 0.2, 0.9, np.nan]),
-        np.array([True, True, False, False]),
+        np.array([True, True, False, False]), np.zeros(4, bool),
     )  # fmt: skip
     assert twice.drawn().tolist() == [1]
 

@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 
 from tilestream.apps.changes import SAME_PLACE
 from tilestream.errors import TileNotReadyError, UsageError
+from tilestream.factors.stations import INTERPOLATED
 from tilestream.grid import MM_PER_M, Box, TileKey
 from tilestream.pipeline.jobs.run_folder import map_of, rows_of
 from tilestream.records import Float64
@@ -52,6 +53,8 @@ class Scene:
     """(k,) measured error of a place, else its estimate; NaN: neither is known [m]."""
     measured: NDArray[np.bool_]
     """(k,) whether it was measured."""
+    interpolated: NDArray[np.bool_]
+    """(k,) whether its estimate is that of places before and behind it."""
 
     @cached_property
     def height_range(self) -> tuple[float, float]:
@@ -121,11 +124,11 @@ def scene_of(
     tiles, counts = _tiles(store, tile)
     total, first = sum(counts), np.array(store.grid.origin_mm(tiles[0])) / MM_PER_M
     kept = thinned(store, dict(zip(tiles, counts, strict=True)), points)
-    at, error, measured = route_of(place)
+    at, error, measured, between = route_of(place)
     if tile is not None:
         here = _inside(store.grid.core(tiles[0]), at)
-        at, error, measured = at[here], error[here], measured[here]
-    return Scene(store, tiles, total, first, kept - first, at - first, error, measured)
+        at, error, measured, between = at[here], error[here], measured[here], between[here]
+    return Scene(store, tiles, total, first, kept - first, at - first, error, measured, between)
 
 
 def _tiles(store: TileStore, only: tuple[int, int] | None) -> tuple[tuple[TileKey, ...], list[int]]:
@@ -153,12 +156,13 @@ def _inside(box: Box, at: Float64) -> NDArray[np.bool_]:
 
 def route_of(
     place: str | os.PathLike[str],
-) -> tuple[Float64, Float64, NDArray[np.bool_]]:
+) -> tuple[Float64, Float64, NDArray[np.bool_], NDArray[np.bool_]]:
     """The places of a run with what is known of their error; none for a tile store.
 
     Returns:
         (k, 3) places of the lidar [m, map frame], (k,) measured errors, else estimates, else NaN
-        [m], (k,) whether measured. Places without a position are left out.
+        [m], (k,) whether measured, (k,) whether interpolated. Places without a position are left
+        out.
     """
     measured = _places(rows_of(place, "errors"), "error_mean")
     estimated = _places(rows_of(place, "predictions"), "estimate")
@@ -167,15 +171,19 @@ def route_of(
     every = measured
     for more in (estimated, *unknown):
         every = np.concatenate([every, _elsewhere(more, every)])
-    return every[:, :3], every[:, 3], np.arange(len(every)) < len(measured)
+    is_measured = np.arange(len(every)) < len(measured)
+    return every[:, :3], every[:, 3], is_measured, every[:, 4] == 1.0
 
 
 def _places(rows: pd.DataFrame | None, column: str | None = None) -> Float64:
-    """(k, 4) position and error of rows with a position; NaN where there is no error."""
+    """(k, 5) position and error of rows with a position, NaN where there is no error, and whether
+    it is interpolated.
+    """
     if rows is None:
-        return np.zeros((0, 4))
+        return np.zeros((0, 5))
     error = rows[column] if column else np.full(len(rows), np.nan)
-    table = np.column_stack([rows[["x", "y", "z"]], error]).astype(np.float64)
+    between = rows["status"] == INTERPOLATED
+    table = np.column_stack([rows[["x", "y", "z"]], error, between]).astype(np.float64)
     kept: Float64 = table[np.isfinite(table[:, :3]).all(axis=1)]
     return kept
 

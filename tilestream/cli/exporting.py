@@ -86,13 +86,15 @@ def _table(told: dict[str, Any]) -> Table:
     spread = " x ".join(cm(told[name], 1) for name in ("along_m", "across_m"))
     times = told["inflation"]
     done = "and are multiplied by it" if told["inflated"] else "--inflate does it"
+    interpolated = told["interpolated"]
+    unsaid = f", of which {interpolated:,} were interpolated and have none" if interpolated else ""
     between = ""
     if told["inflation_low"] is not None:
         between = f" ({told['inflation_low']:.1f} to {told['inflation_high']:.1f})"
     rows = (
         (
             f"{told['places']:,}",
-            f"places, {told['without']:,} more without; routes: {told['routes']:,}",
+            f"places, {told['without']:,} more without{unsaid}; routes: {told['routes']:,}",
         ),
         ("", told["rest_on"]),
         (spread, "along x across, median standard deviation of a filter's registration"),

@@ -51,7 +51,9 @@ def legend(scene: Scene) -> list[Text]:
     measured, known = scene.measured.sum(), np.isfinite(scene.error).sum()
     if len(scene.places):
         told = f"route: {measured:,} places measured (large), {known - measured:,} estimated "
-        lines.append(Text(told + f"(small), {len(scene.places) - known:,} neither (grey)"))
+        between = int(scene.interpolated.sum())
+        told += f"(small{f', {between:,} of them interpolated' if between else ''}), "
+        lines.append(Text(told + f"{len(scene.places) - known:,} neither (grey)"))
     if known:
         edges = [f" {edge * CM_PER_M:g} " for edge in FIXED.edges] + [""]
         line = Text("error [cm]: ")

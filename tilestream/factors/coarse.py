@@ -47,6 +47,10 @@ class Told:
     """Interpolated places, chosen by lot, that were evaluated after all …"""
     off: int
     """… of which so many were farther off than the tolerance, or had no estimate."""
+    off_mean: float | None
+    """How far off those were that had one, in the mean [m]; None: none was checked …"""
+    off_most: float | None
+    """… and at most."""
     off_share: float | None
     """Share of these; None: none was checked …"""
     off_low: float | None
@@ -69,7 +73,16 @@ class Told:
         return (
             f"{said}Of {self.checked:,} such places that were checked by lot {self.off:,} were off "
             f"by more than {centimetres}: {self.off_share:.0%} ({self.off_low:.0%} to "
-            f"{self.off_high:.0%})."
+            f"{self.off_high:.0%}){self._by}."
+        )
+
+    @property
+    def _by(self) -> str:
+        """By how much, in words."""
+        if self.off_mean is None or self.off_most is None:
+            return ""
+        return (
+            f"; by {100.0 * self.off_mean:.1f} cm on average, at most {100.0 * self.off_most:.1f}"
         )
 
     def plain(self) -> dict[str, object]:
@@ -95,7 +108,7 @@ class Coarse:
         self._estimate = np.full(total, np.nan)
         self._checked: Int64 | None = None
         self._said = np.zeros(0)  # of the checked places, before they were evaluated [m]
-        self._off = 0
+        self._difference = np.zeros(0)  # of those from what they were evaluated to [m]
         self._first = self._rounds = 0
 
     def next(self) -> Int64:
@@ -151,9 +164,11 @@ class Coarse:
         """What was done, and how often what is interpolated is off."""
         count = 0 if self._checked is None else len(self._checked)
         share = low = high = None
+        there = self._difference[np.isfinite(self._difference)]
+        off = int((~(self._difference <= self._settings.tolerance)).sum())
         if count:
-            interval = binomtest(self._off, count).proportion_ci(0.95, method="wilson")
-            share, low, high = self._off / count, float(interval.low), float(interval.high)
+            interval = binomtest(off, count).proportion_ci(0.95, method="wilson")
+            share, low, high = off / count, float(interval.low), float(interval.high)
         return Told(
             self._settings.every,
             self._settings.tolerance,
@@ -163,7 +178,9 @@ class Coarse:
             len(self.interpolated),
             self._rounds,
             count,
-            self._off,
+            off,
+            float(there.mean()) if there.size else None,
+            float(there.max()) if there.size else None,
             share,
             low,
             high,
@@ -216,5 +233,4 @@ class Coarse:
         if self._checked is None or not self._said.size:
             return
         said, self._said = self._said, np.zeros(0)
-        close = np.abs(said - self._estimate[self._checked]) <= self._settings.tolerance
-        self._off = int((~close).sum())
+        self._difference = np.abs(said - self._estimate[self._checked])

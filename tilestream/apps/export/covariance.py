@@ -65,9 +65,10 @@ def export(
         lost: … or `p_lost` above this.
 
     Returns:
-        What was written: `file`, `format`, `places` (with a covariance), `without`, `routes`,
-        `spacing_m`, `prediction_error_m`, `every_m`, `correlation_length_m` (of the bias along and
-        across; None: not known) and `correlation_length` (in words), `inflation` (None: not known)
+        What was written: `file`, `format`, `places` (with a covariance), `without`, of these
+        `interpolated`, `routes`, `spacing_m`, `prediction_error_m`, `every_m`,
+        `correlation_length_m` (of the bias along and across; None: not known) and
+        `correlation_length` (in words), `inflation` (None: not known)
         and `inflation_low` to `inflation_high`, between which it lies had other pieces of road been
         seen (90 %; None: the road is too short to say), `inflated`,
         `rest_on` (whether they were calibrated, in words), `poor_stretches`, `poor_length_m`, and

@@ -18,6 +18,7 @@ from tilestream.model.correlation import POOLED
 from tilestream.model.covariance import COVARIANCE_COLUMNS
 from tilestream.moments import SCORES
 from tilestream.records import Float64
+from tilestream.report.data import interpolated
 from tilestream.report.exports.geometry import crs_of
 from tilestream.report.exports.tables import write_csv, write_json, write_text
 from tilestream.report.segments import reaches
@@ -111,6 +112,7 @@ def summary(made: CovarianceExport) -> dict[str, Any]:
     told = {
         "places": int(known.sum()),
         "without": int((~known).sum()),
+        "interpolated": int(interpolated(made.places).sum()),
         "routes": int(made.places["route_id"].nunique()),
         "spacing_m": made.spacing,
         "prediction_error_m": made.found.prediction_error,

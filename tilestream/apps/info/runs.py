@@ -8,6 +8,7 @@ import numpy as np
 
 from tilestream.apps.info.record import Info, told
 from tilestream.errors import TilestreamError, alike
+from tilestream.factors.stations import INTERPOLATED
 from tilestream.files import Files
 from tilestream.marks import unsealed
 from tilestream.pipeline.jobs.run_folder import map_of, rows_of, table_paths
@@ -18,7 +19,7 @@ from tilestream.settings import LogOptions
 def described(path: str, _: LogOptions) -> Info:
     """A run directory of any job: its tables, and what its record says."""
     record, state = _record(path)
-    contents, wrong, rows = [], [], None
+    contents, wrong, rows, between = [], [], None, 0
     for table in TABLES:
         try:
             files = table_paths(path, table)
@@ -29,6 +30,7 @@ def described(path: str, _: LogOptions) -> Info:
         if found is not None:
             contents.append(f"table {table}: {len(found):,} rows in {len(files):,} files")
             rows = found if rows is None else rows
+            between += int((found["status"] == INTERPOLATED).sum())
     try:
         store = map_of(path)
         crs, made_on = store.settings.crs, store.url
@@ -47,6 +49,7 @@ def described(path: str, _: LogOptions) -> Info:
         coverage={
             "places": 0 if rows is None else len(rows),
             "places_done": 0 if rows is None else int((rows["status"] == "done").sum()),
+            **({"places_interpolated": between} if between else {}),
             "drives": len(drives),
             "scans": sum(drive["scans"] for drive in drives),
             "scans_measured": sum(drive["measured"] for drive in drives),
