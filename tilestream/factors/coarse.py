@@ -62,9 +62,12 @@ class Told:
     def words(self) -> str:
         """The same as sentences."""
         n = self.interpolated
-        said = f"{self.evaluated:,} virtual drives were taken for {self.places:,} places"
+        said = (
+            f"{self.evaluated:,} virtual drives were taken for {self.places:,} places, an estimate "
+            f"averages those around it: {self.places - n:,} have what a run of all places gives"
+        )
         if not n:
-            return f"{said}: none is interpolated."
+            return f"{said}, none is interpolated."
         said += f"; {n:,} others are not evaluated: where they have ground, they are interpolated "
         said += "along their route. "
         if self.off_share is None:
