@@ -168,7 +168,8 @@ class Dataset:
                 raise UsageError(f"no group {name!r}; there are {', '.join(known)}")
         which = np.flatnonzero(self.rows["group"].isin(list(names)).to_numpy())
         kept = {name: self.data_sets[name] for name in names if name in self.data_sets}
-        return replace(self.take(which), data_sets=kept)
+        lost = self.lost[self.lost["group"].isin(list(names))].reset_index(drop=True)
+        return replace(self.take(which), lost=lost, data_sets=kept)
 
     def with_columns(self, columns: Sequence[Column]) -> "Dataset":
         """With these factors as features.

@@ -1,5 +1,6 @@
 """What makes the estimates of a run: a model that is there, one trained here, the virtual drive."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from tilestream.errors import ModelError
@@ -32,7 +33,7 @@ class Estimator:
         return self.use is None and not self.trained
 
 
-def estimator_of(settings: RunSettings, labelled: int) -> Estimator:
+def estimator_of(settings: RunSettings, labelled: int, otherwise: Sequence[str] = ()) -> Estimator:
     """What makes the estimates, as soon as it is known how many places are measured.
 
     With too few of them to train on, the model that ships does, if it fits the job; else the
@@ -40,7 +41,8 @@ def estimator_of(settings: RunSettings, labelled: int) -> Estimator:
 
     Args:
         settings: the job.
-        labelled: how many places are measured.
+        labelled: how many places are measured, as the vehicle's lidar.
+        otherwise: the drives that are read as another one, and so train nothing.
     """
     model = settings.model
     if model.use is not None:
@@ -50,6 +52,8 @@ def estimator_of(settings: RunSettings, labelled: int) -> Estimator:
     if labelled >= POINTS_MIN or settings.observe is None:
         return Estimator(trained=True)
     few = f"{labelled} labels, {POINTS_MIN} are needed to train {model.recipe}"
+    if otherwise:
+        few += f" (not counted: {', '.join(otherwise)}, of another lidar than the vehicle's)"
     more = "to train, measure longer drives, or more of them, or places nearer to each other; "
     more += WITHOUT_DRIVES
     unfit = _unfit(settings)

@@ -22,11 +22,12 @@ from tilestream.pipeline.jobs.run_inputs import (
     inputs_of,
     is_simulated,
     map_scans,
+    seen_otherwise,
     simulated_folder,
     simulations,
 )
 from tilestream.pipeline.jobs.run_notes import with_logs
-from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
+from tilestream.pipeline.jobs.run_plan import places_to_train, plan_estimate, plan_measure
 from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.jobs.simulate import plan_simulation
 from tilestream.pipeline.jobs.sources import ingest_settings, map_notes
@@ -69,10 +70,12 @@ def forecast(settings: RunSettings) -> Forecast:
     map_plan, reading, notes, sources = _expected_map(settings, inputs)
     inputs = with_logs(settings, inputs, sources)
     measure = plan_measure(settings, inputs, map_plan)
-    by = estimator_of(settings, sum(task.work for task in measure.outputs("label")))
+    otherwise = seen_otherwise(settings, inputs.drives)
+    labels = measure.outputs("label")
+    by = estimator_of(settings, places_to_train(labels, otherwise), otherwise)
     rounds, measure = first_round(settings, map_plan, measure, by)
     done = [Outcome(task.key, task.stage) for task in measure.tasks]
-    estimate = plan_estimate(settings, map_plan.store.grid, measure, done, by)
+    estimate = plan_estimate(settings, map_plan.store.grid, measure, done, by, otherwise=otherwise)
     tasks = (*reading, *measure.tasks, *estimate.tasks)
     far = {"routes": off_map(map_plan.points, map_plan.store.grid, inputs.routes)}
     lost = [f"{name} is left out: {reason}" for name, reason in measure.left_out.items()]

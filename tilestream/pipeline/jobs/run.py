@@ -46,7 +46,6 @@ from tilestream.pipeline.jobs.run_inputs import (
     check_files,
     check_model,
     inputs_of,
-    seen_otherwise,
 )
 from tilestream.pipeline.jobs.run_lanes import lanelet_maps_of
 from tilestream.pipeline.jobs.run_names import RECORD
@@ -56,6 +55,7 @@ from tilestream.pipeline.jobs.run_notes import (
     lost_labels,
     run_notes,
 )
+from tilestream.pipeline.jobs.run_plan import places_to_train
 from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
 from tilestream.pipeline.jobs.run_story import Story, estimate_large
 from tilestream.pipeline.jobs.starts_of import starts_of
@@ -199,9 +199,9 @@ def _report(settings: RunSettings, inputs: Inputs, story: Story, book: Book) -> 
     book.facts["drives"] = [drive.plain() for drive in measured]
     if not done.outputs("factors"):
         return
-    by = story.estimator
+    by, otherwise = story.estimator, story.otherwise
     told = (
-        {JOB: offset_told(done, settings, by)},
+        {JOB: offset_told(places_to_train(done.outputs("label"), otherwise), settings, by)},
         heights_told(done, settings),
         log_poses_told(done),
     )
@@ -216,7 +216,7 @@ def _report(settings: RunSettings, inputs: Inputs, story: Story, book: Book) -> 
         _facts(settings, inputs, book, known, _model_facts(settings, done, by)),
         settings,
         by,
-        seen_otherwise(settings, inputs.drives),
+        otherwise,
     )
     found = replace(
         found,

@@ -77,11 +77,6 @@ class Done:
         }
 
     @property
-    def labelled(self) -> int:
-        """How many places were measured, or could not be."""
-        return sum(task.work for task in self.outputs("label"))
-
-    @property
     def width(self) -> float:
         """Over what the virtual drives of the estimates are averaged along the route [m]."""
         for task in self.outputs("predict")[:1]:
@@ -129,9 +124,10 @@ def heights_told(done: Done, settings: RunSettings) -> dict[str, list[str]]:
     return notes
 
 
-def offset_told(done: Done, settings: RunSettings, estimator: Estimator) -> list[str]:
-    """A note where `physics` makes the estimates as it is, and nobody asked for that."""
-    labelled = done.labelled
+def offset_told(labelled: int, settings: RunSettings, estimator: Estimator) -> list[str]:
+    """A note where `physics` makes the estimates as it is, with so many labels to learn from, and
+    nobody asked for that.
+    """
     fits = estimator.untrained and not estimator.few
     if not labelled or settings.model.offset is not None or not fits:
         return []
@@ -153,19 +149,22 @@ def labels_of(
         dataset: what was measured.
         places: every sample point.
         points: held-out points of the model that leaves paths out, with intervals; None: the model
-            in use was trained elsewhere, so that its estimates are held out as they are.
+            in use was trained elsewhere, so that its estimates are held out as they are. Their
+            `row` counts the labels that are not `own`.
         reach: how far along the path of a label that may have been said [m].
         own: groups of labels that were seen with another lidar than the vehicle's, for which the
-            estimates of `places` are. Without `points` they have that of their own virtual drive,
-            and none by a model, which was trained for the vehicle's.
+            estimates of `places` are. They have none by a model, which is trained for the
+            vehicle's; without one that of their own virtual drive.
         offset: without a model: what a real scan adds to the error of a virtual one [m].
     """
     if dataset is None:
         return pd.DataFrame()
     names = ["held_out", "low", "high"]
     if points is not None:
+        learnt = (~dataset.rows["group"].isin(list(own))).to_numpy()
+        rows = np.where(learnt, np.cumsum(learnt) - 1, -1)
         said = points.set_index("row")[["estimate", "low", "high"]]
-        here = said.reindex(np.arange(len(dataset))).to_numpy(np.float64)
+        here = said.reindex(rows).to_numpy(np.float64)
         return dataset.rows.assign(**dict(zip(names, here.T, strict=True)))
     said = places.rename(columns={"route_id": "path", "estimate": "held_out"})
     found = nearest_along(dataset.rows, said[["path", "arc_length", *names]], reach)
@@ -236,6 +235,14 @@ def ceilings(dataset: Dataset | None, targets: Sequence[str]) -> dict[str, dict[
     return found
 
 
+def _without(dataset: Dataset | None, otherwise: Collection[str]) -> Dataset | None:
+    """The dataset without these groups; None: nothing is left."""
+    if dataset is None or not otherwise:
+        return dataset
+    left = [name for name in dataset.rows["group"].unique() if name not in otherwise]
+    return dataset.groups(left) if left else None
+
+
 def findings_of(
     done: Done,
     store: TileStore,
@@ -260,7 +267,7 @@ def findings_of(
     points = with_intervals(held) if isinstance(held, pd.DataFrame) else _NO_POINTS
     weights = paths_of(done.outputs("importance"))
     weighed = read_tables(weights) if weights else pd.DataFrame({"factor": []})
-    ceiling_of = ceilings(dataset, TARGETS)
+    ceiling_of = ceilings(_without(dataset, otherwise), TARGETS)
     labels = labels_of(
         None if dataset is None else dataset.averaged(done.width),
         places,
@@ -350,7 +357,7 @@ def _worth(
     else:
         trained = done.outputs("train")
         model = trained[0].writes.read() if trained else None
-        words = f"a model trained here ({own})"
+        words = f"a model trained here ({own})" if trained else f"none: {own} could not be trained"
     of_blocks = [
         {str(name): value for name, value in row.items()}
         for row in protocols.to_dict("records")

@@ -268,6 +268,26 @@ def seen_otherwise(settings: RunSettings, drives: Sequence[DriveSettings]) -> li
     return [drive.group for drive in drives if drive.degraded in others]
 
 
+def check_lidars(settings: RunSettings) -> None:
+    """Refuse drives to train on that are read as different lidars, before anything is made.
+
+    Raises:
+        UsageError: says which, and what to do.
+    """
+    model = settings.model
+    if model.use is not None or model.offset is not None:
+        return
+    others = seen_otherwise(settings, settings.drives)
+    read_as = {d.degraded: d.group for d in settings.drives if d.group not in others}
+    if len(read_as) > 1:
+        told = ", ".join(f"{g} ({kind or 'as recorded'})" for kind, g in sorted(read_as.items()))
+        raise UsageError(
+            f"drives of different lidars are to train one model: {told}: read them alike (beams, "
+            "range_max, blind_rear_deg of each drive), give the others a job of their own, or "
+            "model.use, e.g. shipped"
+        )
+
+
 def making_of(settings: RunSettings) -> dict[str, Any]:
     """What the factors are made with, as a model remembers it."""
     making = made_with(COLUMNS, settings.looking_sensor, settings.cell_size)
@@ -315,15 +335,17 @@ def check_model(settings: RunSettings) -> None:
 
 
 def check_files(settings: RunSettings) -> None:
-    """Refuse a job of real files that are not there, before anything is made.
+    """Refuse a job of real files that are not there, or of drives that cannot train one model,
+    before anything is made.
 
     Raises:
         SourceNotFoundError: no source of the map, no log, or no file of routes of that name.
         SourceError, OSError: no source of the map is of a format that is read.
         StoreError: the map is to be there and cannot be opened.
-        UsageError: the run directory is a tile store.
+        UsageError: the run directory is a tile store; as `check_lidars`.
     """
     require_folder(settings.out)
+    check_lidars(settings)
     if settings.simulate is not None:
         return
     require_format(settings.map.sources)

@@ -1,7 +1,7 @@
 """What the main job runs: tiles, factors and errors; then what is learnt of them."""
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from tilestream.errors import SourceError, SourceNotFoundError, TileNotReadyError
@@ -40,7 +40,7 @@ from tilestream.pipeline.stages.importance import importance
 from tilestream.pipeline.stages.label import label
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.observe import observe_drive
-from tilestream.pipeline.stages.samples import COLUMNS, DatasetFile, PlacesOf, samples
+from tilestream.pipeline.stages.samples import COLUMNS, DatasetFile, DrivesOf, PlacesOf, samples
 from tilestream.pipeline.stages.train import ModelFile, train
 from tilestream.report.data import BESIDE
 from tilestream.settings import DriveSettings
@@ -165,6 +165,7 @@ def plan_estimate(
     outcomes: Sequence[Outcome],
     estimator: Estimator | None = None,
     between: Mapping[TileKey, Between] | None = None,
+    otherwise: Sequence[str] = (),
 ) -> Plan:
     """Samples, evaluate, train, predict: from what was measured.
 
@@ -179,6 +180,8 @@ def plan_estimate(
         outcomes: what became of it.
         estimator: what makes the estimates; None: by how many places were measured.
         between: by tile, where a coarse run interpolates.
+        otherwise: the drives that are read as another lidar than the vehicle's: they are measured,
+            and train nothing.
     """
     done = {outcome.key for outcome in outcomes if outcome.ok}
     factors, observed, labels = (
@@ -188,7 +191,7 @@ def plan_estimate(
     blind = {task.tile for task in measure.outputs("observe") if task.key not in done}
     factors = [task for task in factors if task.tile not in blind]
     tasks: list[Task] = []
-    estimator = estimator or estimator_of(settings, sum(task.work for task in labels))
+    estimator = estimator or estimator_of(settings, places_to_train(labels, otherwise), otherwise)
     known = not estimator.trained
     model: Readable | None = model_there(estimator)
     if labels and factors:
@@ -196,10 +199,11 @@ def plan_estimate(
         joined = _samples(settings, factors, of_drives, labels)
         tasks.append(joined)
         if not known:
-            training = _training(settings, joined)
+            learns = _of_vehicle(joined, labels, otherwise)
+            training = _training(settings, joined, learns)
             known, model = True, training.product
-            tasks += [training, *_evaluations(settings, joined, bool(observed))]
-            tasks.append(_importance(settings, joined, training))
+            tasks += [training, *_evaluations(settings, joined, learns, bool(observed))]
+            tasks.append(_importance(settings, joined, learns, training))
     if known:
         tasks += prediction_tasks(settings, grid, factors, observed, model, between)
     return Plan.of(tasks, settings.memory)
@@ -239,6 +243,19 @@ def _samples(
     )
 
 
+def places_to_train(labels: Iterable[Task], otherwise: Collection[str]) -> int:
+    """How many places these tasks measure, without those of another lidar than the vehicle's."""
+    return sum(task.work for task in labels if _group(task) not in otherwise)
+
+
+def _of_vehicle(joined: Task, labels: Sequence[Task], otherwise: Collection[str]) -> Readable:
+    """What is learnt from: of the joined dataset the drives read as the vehicle's lidar."""
+    if not otherwise:
+        return joined.product
+    groups = dict.fromkeys(map(_group, labels))
+    return DrivesOf(joined.product, tuple(name for name in groups if name not in otherwise))
+
+
 def _group(task: Task) -> str:
     """Of which drive, as whose sensor, a task is: `errors/<group>/…`, `drives/<group>/…/…`."""
     assert isinstance(task.writes, Parquet)
@@ -246,18 +263,20 @@ def _group(task: Task) -> str:
     return parts[-2] if task.stage == label.name else parts[-3]
 
 
-def _training(settings: RunSettings, joined: Task) -> Task:
+def _training(settings: RunSettings, joined: Task, learns: Readable) -> Task:
     return Task(
         train,
         "model",
         ModelFile(f"{settings.out}/model.skops"),
         takes={"recipe": settings.model.recipe, "seed": settings.model.seed},
-        reads={"dataset": joined.product},
+        reads={"dataset": learns},
         counts=joined.counts,
     )
 
 
-def _evaluations(settings: RunSettings, joined: Task, observed: bool) -> list[Task]:
+def _evaluations(
+    settings: RunSettings, joined: Task, learns: Readable, observed: bool
+) -> list[Task]:
     """Every model and opponent on all factors; the paper's forest on each set of Table IV, the
     other regressors on those with all four criteria; the parts of the error by the regressor in
     use, the virtual drive and the training median.
@@ -283,19 +302,19 @@ def _evaluations(settings: RunSettings, joined: Task, observed: bool) -> list[Ta
                 name,
                 Parquet(f"{folder}/{name}.parquet"),
                 takes={**takes, "seed": model.seed},
-                reads={"dataset": joined.product},
+                reads={"dataset": learns},
                 counts=joined.counts,
             )
         )
     return tasks
 
 
-def _importance(settings: RunSettings, joined: Task, training: Task) -> Task:
+def _importance(settings: RunSettings, joined: Task, learns: Readable, training: Task) -> Task:
     return Task(
         importance,
         "factors",
         Parquet(f"{settings.out}/tables/judged/weights.parquet"),
         takes={"seed": settings.model.seed},
-        reads={"dataset": joined.product, "model": training.product},
+        reads={"dataset": learns, "model": training.product},
         counts=joined.counts,
     )

@@ -23,9 +23,9 @@ from tilestream.pipeline.jobs.map_update import Update
 from tilestream.pipeline.jobs.rounds import Rounds, first_round, remove_rounds
 from tilestream.pipeline.jobs.run_before import keep_before, update_of
 from tilestream.pipeline.jobs.run_book import Book
-from tilestream.pipeline.jobs.run_inputs import Inputs, read_map
+from tilestream.pipeline.jobs.run_inputs import Inputs, read_map, seen_otherwise
 from tilestream.pipeline.jobs.run_notes import with_logs
-from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
+from tilestream.pipeline.jobs.run_plan import places_to_train, plan_estimate, plan_measure
 from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.store import TileStore, open_store
@@ -64,6 +64,8 @@ class Story:
         """What is left to be run by all workers together, when all else is done."""
         self.rounds: Rounds | None = None
         """Those of a coarse run; None: all places are evaluated."""
+        self.otherwise = seen_otherwise(settings, self.inputs.drives)
+        """The drives that are read as another lidar than the vehicle's, and so train nothing."""
         self._tiles: set[str] = set()
         self._open: set[str] = set()
         self._early = _Early((), set())
@@ -141,9 +143,9 @@ class Story:
 
     def _estimated(self) -> tuple[Task, ...]:
         """What is to be done when all is measured."""
-        labels = {task.key: task.work for task in self.measure.outputs("label")}
-        good = (outcome.key for outcome in self.book.outcomes if outcome.ok)
-        self.estimator = estimator_of(self.settings, sum(labels.get(key, 0) for key in good))
+        good = {outcome.key for outcome in self.book.outcomes if outcome.ok}
+        labels = [task for task in self.measure.outputs("label") if task.key in good]
+        self._decide(places_to_train(labels, self.otherwise))
         planned = self._plan(self.book.outcomes)
         joined = planned.outputs("samples")
         if not (self.estimator.trained and joined):
@@ -155,9 +157,18 @@ class Story:
 
     def _joined(self, outcome: Outcome) -> tuple[Task, ...]:
         """What is to be done when it is known how many labels there are to train on."""
-        labelled = int(outcome.facts["rows"]) if outcome.ok else 0
-        self.estimator = estimator_of(self.settings, labelled)
+        self._decide(self._labelled() if outcome.ok else 0)
         return self._rest(self._plan(self.book.outcomes))
+
+    def _labelled(self) -> int:
+        """How many places are joined that a model may learn from."""
+        joined = next(task for task in self.book.tasks if task.key == self._joining)
+        groups = joined.writes.read().rows["group"]
+        return int((~groups.isin(self.otherwise)).sum())
+
+    def _decide(self, labelled: int) -> None:
+        """What makes the estimates, with so many places to learn from."""
+        self.estimator = estimator_of(self.settings, labelled, self.otherwise)
 
     def _rest(self, planned: Plan) -> tuple[Task, ...]:
         """What of the whole plan has not been given out."""
@@ -179,7 +190,13 @@ class Story:
         """What is learnt and estimated from what was measured."""
         between = None if self.rounds is None else self.rounds.between()
         return plan_estimate(
-            self.settings, self.store.grid, self.measure, outcomes, self.estimator, between
+            self.settings,
+            self.store.grid,
+            self.measure,
+            outcomes,
+            self.estimator,
+            between,
+            self.otherwise,
         )
 
     def _close_map(self) -> None:
@@ -196,8 +213,7 @@ class Story:
             keep_before(self.settings)
         self.measure = plan_measure(self.settings, self.inputs, map_plan)
         self.book.failures |= self.measure.left_out
-        labelled = sum(task.work for task in self.measure.outputs("label"))
-        self.estimator = estimator_of(self.settings, labelled)
+        self._decide(places_to_train(self.measure.outputs("label"), self.otherwise))
         self.rounds, self.measure = first_round(
             self.settings, map_plan, self.measure, self.estimator
         )

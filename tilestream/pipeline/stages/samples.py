@@ -170,6 +170,35 @@ class PlacesOf:
         return {}
 
 
+@dataclass(frozen=True)
+class DrivesOf:
+    """Some drives of a dataset."""
+
+    dataset: Product
+    groups: tuple[str, ...]
+    """Their names."""
+
+    @property
+    def identity(self) -> str:
+        """Hash of the dataset and the names."""
+        return hash_of((self.dataset.identity, self.groups))
+
+    @property
+    def makers(self) -> tuple[str, ...]:
+        """As of the dataset."""
+        return self.dataset.makers
+
+    def read(self) -> Dataset:
+        """Their rows only; drives without a label are not there."""
+        dataset: Dataset = self.dataset.read()
+        there = set(dataset.rows["group"])
+        return dataset.groups([name for name in self.groups if name in there])
+
+    def counts(self) -> Counts:
+        """As of the dataset."""
+        return self.dataset.counts()
+
+
 MAKERS = (factors_drive, observe_drive, register, label)
 """The stages that make what is joined."""
 
