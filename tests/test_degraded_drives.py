@@ -9,11 +9,23 @@ import pytest
 from streets import job, street, write_drive
 
 import tilestream as ts
+from tilestream.errors import UsageError
 from tilestream.factors.along_route import AVERAGED, WIDTH, averaged_along
 from tilestream.formats.points.pcd import write_pcd
+from tilestream.model import dataset as dataset_module
+from tilestream.model.dataset import Dataset
+from tilestream.model.file import load_model
+from tilestream.pipeline.jobs import estimator as estimator_module
+from tilestream.pipeline.jobs import run_settings as run_settings_module
+from tilestream.pipeline.jobs.forecast import forecast
 from tilestream.pipeline.jobs.run import dataset_of
 from tilestream.pipeline.jobs.run_findings import labels_of
-from tilestream.pipeline.jobs.run_inputs import degraded_drives, inputs_of, observing_of
+from tilestream.pipeline.jobs.run_inputs import (
+    check_lidars,
+    degraded_drives,
+    inputs_of,
+    observing_of,
+)
 from tilestream.pipeline.jobs.run_plan import plan_measure
 from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.stages.map_plan import MapPlan
@@ -116,6 +128,47 @@ def test_no_estimate_of_the_vehicle_stands_beside_its_labels(
     by_arc = places.set_index("arc_length")["estimate"].sort_index()
     at = [int(np.abs(by_arc.index - arc).argmin()) for arc in whole["arc_length"]]
     np.testing.assert_array_equal(whole["held_out"], by_arc.iloc[at])
+
+
+def test_a_drive_of_a_lesser_lidar_trains_nothing(
+    run: RunSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Model and estimates are those of the job without it; its labels stand alone."""
+    few = 5
+    for module in (dataset_module, estimator_module, run_settings_module):
+        monkeypatch.setattr(module, "POINTS_MIN", few)
+    learning = {"map": {"store": run.store_url}, "model": {"recipe": "physics"}}
+    values = run.model_dump() | learning
+    found = {}
+    for name, drives in (("both", run.drives), ("whole", run.drives[:1])):
+        ts.run(RunSettings(**values | {"out": str(tmp_path / name), "drives": drives}))
+        model = load_model(str(tmp_path / name / "model.skops"))
+        places = pd.read_parquet(tmp_path / name / "report" / "places.parquet")
+        found[name] = (model.facts["groups"], model.facts["learnt"], places["estimate"].to_numpy())
+    assert found["both"][:2] == found["whole"][:2]
+    assert found["both"][0] == ["whole"]
+    np.testing.assert_array_equal(found["both"][2], found["whole"][2])
+    assert set(ts.read_run(tmp_path / "both")["drive"].dropna()) == {"whole"}
+
+
+def test_what_is_held_out_stays_with_its_label() -> None:
+    """Rows of a model that leaves paths out count the labels that it knows."""
+    groups = ["a", "b", "a", "b", "a"]
+    rows = pd.DataFrame({"group": groups, "error_mean": np.arange(5.0)})
+    dataset = Dataset(rows, (), pd.DataFrame({"group": []}))
+    points = pd.DataFrame({"row": [2, 0], "estimate": [4.0, 0.0], "low": 0.0, "high": 9.0})
+    found = labels_of(dataset, pd.DataFrame(), points, 1.0, ["b"])
+    np.testing.assert_array_equal(found["held_out"], [0.0, np.nan, np.nan, np.nan, 4.0])
+
+
+def test_drives_of_different_lidars_train_no_one_model(run: RunSettings) -> None:
+    """Told before anything is made, where none of them is the vehicle's by its virtual drive."""
+    blind = {"observe": None, "model": {"recipe": "paper"}}
+    settings = RunSettings(**run.model_dump() | blind)
+    with pytest.raises(UsageError, match=r"whole .as recorded., short .9m."):
+        forecast(settings)
+    check_lidars(RunSettings(**run.model_dump() | blind | {"drives": run.drives[1:]}))
+    check_lidars(run)
 
 
 def test_another_drive_changes_nothing_of_the_first(run: RunSettings) -> None:
