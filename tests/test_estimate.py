@@ -24,7 +24,7 @@ from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.jobs.estimate import estimate_settings
 from tilestream.pipeline.jobs.forecast import forecast
 from tilestream.pipeline.jobs.inventory import tables_in
-from tilestream.pipeline.jobs.run_inputs import inputs_of
+from tilestream.pipeline.jobs.run_inputs import as_far_as_known, inputs_of
 from tilestream.pipeline.jobs.run_settings import ModelSettings, RunSettings
 from tilestream.pipeline.stages import observe as observe_stage
 from tilestream.pipeline.stages import samples as samples_stage
@@ -158,6 +158,23 @@ def test_a_shipped_model_that_does_not_fit_is_refused_and_leads_on(
     with pytest.raises(ModelError, match=r"^shipped: cell_size does not match.*model physics"):
         ts.run(asked(list(own.map.sources), list(own.routes), tmp_path / "run", cell_size=1.0))
     assert not (tmp_path / "run").exists()
+
+
+def test_where_no_place_can_be_estimated_nothing_reads_as_done(
+    inputs: Path, tmp_path: Path, capsys: Told
+) -> None:
+    """A route beside the map: exit code, reason, and what the gate says."""
+    beside = tmp_path / "beside.csv"
+    beside.write_text("x,y,z\n0,60,0\n12,60,0\n")
+    line = ["estimate", str(inputs / "map_canyon.pcd"), "--route", str(beside), "--spacing", "4"]
+    line += ["--model", "physics", "--workers", "1", "--out", str(tmp_path / "run")]
+    assert command([*line, "--fail-over", "0.5"]) == 1
+    said = capsys.readouterr()
+    assert "4 of 4 places have no estimate: no ground" in said.out
+    assert "the gate is closed: no estimate at all on beside" in said.err
+    told = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert told["state"] == "failed"
+    assert told["failures"]["estimates"].startswith("no place has one: no ground")
 
 
 # --- Where
@@ -354,7 +371,7 @@ def test_virtual_scans_reach_as_far_as_the_model_knows_unless_told(
     sensor: str, model: str, asked: float | None, seen: float | None, tmp_path: Path
 ) -> None:
     """The model that ships knows 15 to 100 m, and an HDL-64 has 120."""
-    settings = estimate_settings(
+    given = estimate_settings(
         ["map.pcd"],
         ["route.csv"],
         tmp_path / "run",
@@ -365,5 +382,7 @@ def test_virtual_scans_reach_as_far_as_the_model_knows_unless_told(
         MapSettings(),
         ReportSettings(),
     )
+    settings = as_far_as_known(given)
+    assert as_far_as_known(settings) == settings
     assert settings.observe is not None
     assert settings.observe.range_max == seen

@@ -35,6 +35,7 @@ from tilestream.report.drives import EVALUATED, DriveMeasured
 from tilestream.report.formatting import cm, distance
 from tilestream.report.gate import GateSettings, Over
 from tilestream.report.measured import Measured
+from tilestream.report.summary import reasons_told
 from tilestream.settings import (
     CoarseSettings,
     LabelSettings,
@@ -169,7 +170,7 @@ def do_and_tell(
 ) -> None:
     """Run the main job, print its headline, and close the gate where one is asked for.
 
-    What failed is told after the headline of what is done.
+    What failed is told after the headline of what is done, and what the gate says of that.
 
     Raises:
         PartialError: some of the work failed; lists it.
@@ -189,10 +190,15 @@ def do_and_tell(
         show_report(folder)
         if update is not None:
             show_update(folder, update)
+    try:
+        if gate_of.fail_over is not None:
+            require_within(folder, gate_of.fail_over, gate_of.measure, gate_of.over)
+    except LimitError as error:
+        if failed is None:
+            raise
+        say(f"the gate is closed: {error}", to=err)
     if failed is not None:
         raise failed
-    if gate_of.fail_over is not None:
-        require_within(folder, gate_of.fail_over, gate_of.measure, gate_of.over)
 
 
 def do_job(settings: RunSettings, cluster: Cluster) -> Files:
@@ -219,7 +225,7 @@ def show_report(folder: Files) -> None:
             say(f"  {sentence}")
     out.print(report_table(report, cards(report)))
     say(f"The matcher is {report['facts']['matcher']['name']}")
-    for line in [*hardly_measured(report), *lost_labels(report)]:
+    for line in [*not_estimated(report), *hardly_measured(report), *lost_labels(report)]:
         say(line)
     say_notes(report["notes"])
     say(f"The report is at {folder.under('report/index.html').address}")
@@ -238,6 +244,15 @@ def show_update(folder: Files, update: dict[str, Any]) -> None:
     worse, limit = distance(float(found.worse["length"].sum())), cm(found.limit, 0)
     why = f": `tilestream diff {folder.address}` says where and why" if len(found.worse) else ""
     say(f"{worse} of road got worse by more than {limit}{why}")
+
+
+def not_estimated(report: dict[str, Any]) -> list[str]:
+    """A line on the places without an estimate, and why; none: all have one."""
+    head = report["headline"]
+    if not head["missing"]:
+        return []
+    why = reasons_told(head["missing_by_reason"])
+    return [f"{head['missing']:,} of {head['places']:,} places have no estimate: {why}"]
 
 
 def hardly_measured(report: dict[str, Any]) -> list[str]:

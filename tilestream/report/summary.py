@@ -26,6 +26,8 @@ from tilestream.version import VERSION
 
 THRESHOLDS = (0.05, 0.10, 0.15, 0.20, 0.25, 0.50)
 """Errors that people ask for [m]: the paper's Table I, and around them."""
+REASONS = 3
+"""So many reasons for missing estimates are told in a line."""
 OF_PATH = ("mae", "spearman", "spearman_low", "spearman_high")
 """How the estimates of a labelled path are told."""
 AXES, STARTS = ("along", "across", "up"), ("floor", "tail")
@@ -124,6 +126,13 @@ def by_reason(reasons: pd.Series) -> dict[str, int]:
     """How often each reason for a missing estimate is given, the commonest first."""
     counts = reasons.fillna("").astype(str).replace("", "no reason given").value_counts()
     return {str(r): int(counts[r]) for r in sorted(counts.index, key=lambda r: (-counts[r], r))}
+
+
+def reasons_told(missing: Mapping[str, int]) -> str:
+    """The reasons for missing estimates, the commonest first, in a line."""
+    first = list(missing.items())[:REASONS]
+    told = [f"{reason.removeprefix('no estimate: ')} ({count:,})" for reason, count in first]
+    return ", ".join(told) + (", …" if len(missing) > REASONS else "")
 
 
 def cards(content: Mapping[str, Any]) -> list[tuple[str, str]]:

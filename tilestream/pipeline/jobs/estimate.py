@@ -8,16 +8,14 @@ from typing import Any
 
 from tilestream.config import Settings
 from tilestream.errors import StoreNotFoundError, UsageError
-from tilestream.files import Files
 from tilestream.matcher import RegistrationSettings
-from tilestream.model.file import load_model
 from tilestream.model.registry import UNTRAINED
-from tilestream.model.shipped import SHIPPED, file_of, is_shipped
+from tilestream.model.shipped import SHIPPED, is_shipped
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.engine.plan import DEFAULT_MEMORY
 from tilestream.pipeline.jobs.run import run
 from tilestream.pipeline.jobs.run_settings import ModelSettings, RunSettings
-from tilestream.sensor import VLP16, Carrier, sensor_of
+from tilestream.sensor import VLP16, Carrier
 from tilestream.settings import (
     PREDICTION_ERROR,
     CoarseSettings,
@@ -169,26 +167,12 @@ def estimate_settings(
         out=os.fspath(out),
         map=map_.model_copy(update=_map_of(sources)),
         routes=tuple(routes),
-        observe=_as_far_as_known(seeing, places.sensor, of_model.use),
+        observe=seeing,
         label=label,
         model=of_model,
         report=report,
         coarse=coarse,
     )
-
-
-def _as_far_as_known(
-    seeing: VirtualSettings, sensor: Carrier | str, use: str | None
-) -> VirtualSettings:
-    """Where no usable range was asked for, at most the farthest that the model was trained over:
-    what lies beyond tells little, and all places would be unlike the training places.
-    """
-    if seeing.range_max is not None or use is None or not Files.at(file_of(use)).there():
-        return seeing
-    known = load_model(file_of(use)).card.get("inputs", {}).get("range_m")
-    if known is None or not known[1] < sensor_of(sensor).range_max:
-        return seeing
-    return seeing.model_copy(update={"range_max": float(known[1])})
 
 
 def _map_of(sources: Sequence[str]) -> dict[str, Any]:

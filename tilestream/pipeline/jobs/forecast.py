@@ -16,6 +16,7 @@ from tilestream.pipeline.jobs.rounds import first_round
 from tilestream.pipeline.jobs.run_before import update_of
 from tilestream.pipeline.jobs.run_inputs import (
     Inputs,
+    as_far_as_known,
     check_files,
     check_model,
     extent,
@@ -63,6 +64,7 @@ def forecast(settings: RunSettings) -> Forecast:
         UsageError, SourceError, StoreError, ModelError: as the job itself.
     """
     check_files(settings)
+    settings = as_far_as_known(settings)
     check_model(settings)
     if settings.simulate is not None and not is_simulated(settings):
         return _simulation_first(settings, settings.simulate)

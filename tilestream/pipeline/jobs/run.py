@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import yaml
 
@@ -43,6 +44,7 @@ from tilestream.pipeline.jobs.run_findings import Done, findings_of, heights_tol
 from tilestream.pipeline.jobs.run_inputs import (
     JOB,
     Inputs,
+    as_far_as_known,
     check_files,
     check_model,
     inputs_of,
@@ -61,7 +63,11 @@ from tilestream.pipeline.jobs.run_story import Story, estimate_large
 from tilestream.pipeline.jobs.starts_of import starts_of
 from tilestream.pipeline.stages.samples import DatasetFile
 from tilestream.report import write_report
-from tilestream.report.summary import plain
+from tilestream.report.data import estimates
+from tilestream.report.summary import by_reason, plain, reasons_told
+
+ESTIMATES = "estimates"
+"""What it is filed under that there are none."""
 
 
 def run(
@@ -99,6 +105,7 @@ def run(
     """
     settings = config if isinstance(config, RunSettings) else read_settings(config)
     check_files(settings)
+    settings = as_far_as_known(settings)
     check_model(settings)
     inputs = None if settings.simulate is not None else inputs_of(settings, client, watch)
     with only_writer(settings.out), _map_alone(settings):
@@ -227,6 +234,10 @@ def _report(settings: RunSettings, inputs: Inputs, story: Story, book: Book) -> 
         ends=lambda group, sample: starts_of(settings.out, sample, group),
         lanelet_maps=lanelet_maps_of(settings, inputs),
     )
+    if not np.isfinite(estimates(found.places)).any():
+        book.failures[ESTIMATES] = (
+            f"no place has one: {reasons_told(by_reason(found.places['reason']))}"
+        )
     text = json.dumps(plain(evaluation), indent=1, allow_nan=False)
     write_text(settings.folder.under("tables/evaluation.json"), text + "\n")
     write_report(found, f"{settings.out}/report", threshold=settings.report.threshold)

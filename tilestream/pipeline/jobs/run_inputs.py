@@ -268,6 +268,22 @@ def seen_otherwise(settings: RunSettings, drives: Sequence[DriveSettings]) -> li
     return [drive.group for drive in drives if drive.degraded in others]
 
 
+def as_far_as_known(settings: RunSettings) -> RunSettings:
+    """Where no usable range was asked for, at most the farthest that the model in use was trained
+    over: what lies beyond tells little, and all places would be unlike the training places.
+    """
+    use, seeing = settings.model.use, settings.observe
+    if seeing is None or seeing.range_max is not None or use is None:
+        return settings
+    if not Files.at(file_of(use)).there():
+        return settings
+    known = load_model(file_of(use)).card.get("inputs", {}).get("range_m")
+    if known is None or not known[1] < settings.vehicle.range_max:
+        return settings
+    reach = {"observe": seeing.model_copy(update={"range_max": float(known[1])})}
+    return settings.model_copy(update=reach)
+
+
 def check_lidars(settings: RunSettings) -> None:
     """Refuse drives to train on that are read as different lidars, before anything is made.
 
