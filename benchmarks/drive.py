@@ -43,8 +43,8 @@ from matplotlib.axes import Axes
 
 import tilestream as ts
 from tilestream.pipeline.engine.cluster import dask_client
-from tilestream.pipeline.engine.plan import DEFAULT_MEMORY
 from tilestream.pipeline.stages.drive_scans import Reading
+from tilestream.settings import DEFAULT_MEMORY
 
 mpl.use("Agg")
 MAPPED = ts.ScanSelection(every=2, offset=0)

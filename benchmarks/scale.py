@@ -59,12 +59,13 @@ from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.cluster import dask_client
 from tilestream.pipeline.engine.executor import execute
 from tilestream.pipeline.engine.frontier import Frontier
-from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan
+from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.engine.stage import Task
 from tilestream.pipeline.jobs.along_routes import plan_factors, samples_along
 from tilestream.pipeline.jobs.inventory import announce, inventory_of
 from tilestream.pipeline.stages.factors import Looking
 from tilestream.pipeline.stages.map_plan import MapPlan, TilePoints
+from tilestream.settings import DEFAULT_MEMORY
 from tilestream.store import Manifest, StoreSettings, TileStore
 
 SPACING = 0.4

@@ -47,11 +47,11 @@ import tilestream as ts
 from tilestream.formats.logs import ScanSelection
 from tilestream.grid import Box
 from tilestream.pipeline.engine.cluster import dask_client
-from tilestream.pipeline.engine.plan import DEFAULT_MEMORY
 from tilestream.pipeline.jobs.simulate import simulate
 from tilestream.pipeline.jobs.simulation_record import SMALL_POINTS
 from tilestream.records import Float64
 from tilestream.report.paper_tables import LIMITS, paper_table_i, table_i
+from tilestream.settings import DEFAULT_MEMORY
 from tilestream.simulation.city import build_city
 from tilestream.simulation.drive import scans
 from tilestream.simulation.settings import SimulationSettings, load_preset

@@ -22,11 +22,10 @@ from tilestream.cli import run
 from tilestream.errors import UsageError
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.formats.routes import route_of
-from tilestream.pipeline.engine.plan import DEFAULT_MEMORY
 from tilestream.pipeline.jobs.along_routes import observe_along
 from tilestream.report import write_comparison
 from tilestream.report.comparison import CELL_BYTES, CHOICE_COLUMNS, Comparison
-from tilestream.settings import VirtualSettings
+from tilestream.settings import DEFAULT_MEMORY, VirtualSettings
 from tilestream.store import cells_table
 from tilestream.tables import read_tables
 

@@ -31,11 +31,10 @@ from tilestream.errors import (
 from tilestream.formats import open_source
 from tilestream.formats.points.las import write_las
 from tilestream.formats.points.pcd import write_pcd
-from tilestream.pipeline.engine import plan
 from tilestream.pipeline.jobs import ingest as ingest_map
 from tilestream.pipeline.jobs import sources
 from tilestream.pipeline.stages import merge, scatter
-from tilestream.settings import IngestSettings
+from tilestream.settings import DEFAULT_MEMORY, IngestSettings
 from tilestream.store import POINTS
 
 
@@ -478,7 +477,7 @@ def test_a_job_that_does_not_fit_its_memory_is_refused_with_advice(clouds: list[
         ingest_map.plan_ingest(clouds, "map.zarr", IngestSettings(), memory=10_000_000)
     made = ingest_map.plan_ingest(clouds, "map.zarr", IngestSettings()).scatters
     assert list(made.describe()) == [("scatter", 3, made.promised_bytes)]
-    assert made.promised_bytes <= plan.DEFAULT_MEMORY
+    assert made.promised_bytes <= DEFAULT_MEMORY
 
 
 def test_two_ingests_at_once_into_two_stores_do_not_meet(

@@ -18,11 +18,10 @@ from tilestream.formats.points.pcd import write_pcd
 from tilestream.formats.routes import route_of
 from tilestream.marks import Mark
 from tilestream.pipeline.engine.attempt import Outcome
-from tilestream.pipeline.engine.plan import DEFAULT_MEMORY
 from tilestream.pipeline.jobs.along_routes import observe_along, plan_observe
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.observe import Observing
-from tilestream.settings import VirtualSettings
+from tilestream.settings import DEFAULT_MEMORY, VirtualSettings
 from tilestream.store import POINTS, Tile
 
 SENSOR = ts.VLP16.model_copy(update={"name": "short", "azimuth_step_deg": 3.0})

@@ -21,12 +21,12 @@ from tilestream.model.file import load_model, save_model
 from tilestream.model.training import check_making, predict, train
 from tilestream.pipeline.engine.executor import execute
 from tilestream.pipeline.engine.outputs import Made, Stored
-from tilestream.pipeline.engine.plan import DEFAULT_MEMORY
 from tilestream.pipeline.jobs.along_routes import plan_factors
 from tilestream.pipeline.jobs.run_inputs import making_of
 from tilestream.pipeline.stages.factors import Looking
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.samples import DatasetFile, samples
+from tilestream.settings import DEFAULT_MEMORY
 
 OVERHEAD = re.findall(r"```python\n(.*?)```", str(owns.__doc__), re.DOTALL)[0]
 """What the documentation shows."""

@@ -129,7 +129,7 @@ def test_flags_of_the_first_version_are_still_taken(old: str, new: str) -> None:
 
 
 def test_memory_is_an_amount_everywhere() -> None:
-    assert PlaceSettings().memory == PlaceSettings(memory="1.5GB").memory == 1_500_000_000
+    assert PlaceSettings().memory == PlaceSettings(memory="2GB").memory == 2_000_000_000
     assert PlaceSettings(memory=2_000_000).memory == 2_000_000
     with pytest.raises(UsageError, match="'much' is no amount of memory"):
         PlaceSettings(memory="much")

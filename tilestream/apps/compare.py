@@ -22,14 +22,14 @@ from tilestream.factors.rows import in_route_order
 from tilestream.grid import MM_PER_M, whole_mm
 from tilestream.matcher import RegistrationSettings
 from tilestream.pipeline.engine.executor import Watch
-from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan
+from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.jobs.along_routes import SENSOR_HEIGHT, samples_along
 from tilestream.pipeline.jobs.inventory import make_tables
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.observe import Observing, observe
 from tilestream.records import Route, RouteZ
 from tilestream.report.comparison import CELL_COLUMNS, ROW_COLUMNS, Comparison
-from tilestream.settings import LabelSettings, VirtualSettings
+from tilestream.settings import DEFAULT_MEMORY, LabelSettings, VirtualSettings
 from tilestream.store import TileStore, cells_table
 from tilestream.tables import read_tables
 

@@ -142,9 +142,10 @@ def places_of(place: str | os.PathLike[str]) -> pd.DataFrame:
 
 def _labels(place: str | os.PathLike[str]) -> pd.DataFrame:
     """The measured places, with the drive of each; of a job none that was seen with another lidar
-    than that of its estimates.
+    than that of its estimates, or that does not fit the map.
     """
-    tables, others = [], _otherwise(place)
+    unfit = told_before(Files.at(place).under(RECORD)).get("unfit", {})
+    tables, others = [], {*_otherwise(place), *unfit}
     for path in table_paths(place, "errors"):
         group = path.rsplit("/", 2)[1]
         if group in others:

@@ -13,10 +13,9 @@ from tilestream.cli.fields import fields, with_settings
 from tilestream.cli.options import AsJson
 from tilestream.cli.printing import out, print_json, say
 from tilestream.cli.progress import progress
-from tilestream.pipeline.engine.plan import DEFAULT_MEMORY
 from tilestream.report.formatting import cm, distance
 from tilestream.report.summary import plain
-from tilestream.settings import ReportSettings
+from tilestream.settings import DEFAULT_MEMORY, ReportSettings
 
 
 @on_cluster

@@ -8,9 +8,6 @@ from tilestream.errors import PlanError
 from tilestream.pipeline.engine.outputs import Parquet
 from tilestream.pipeline.engine.stage import Task
 
-DEFAULT_MEMORY = 1_500_000_000
-"""What a task may use where the user promises nothing else [bytes]."""
-
 
 @dataclass(frozen=True)
 class Plan:

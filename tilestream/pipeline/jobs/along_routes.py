@@ -17,7 +17,7 @@ from tilestream.files import place_of
 from tilestream.grid import MM_PER_M, TileGrid, TileKey, whole_mm
 from tilestream.matcher import RegistrationSettings
 from tilestream.pipeline.engine.executor import Watch
-from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, paths_of
+from tilestream.pipeline.engine.plan import Plan, paths_of
 from tilestream.pipeline.engine.stage import Stage
 from tilestream.pipeline.jobs.inventory import make_tables
 from tilestream.pipeline.stages.factors import Looking, factors, factors_task
@@ -25,7 +25,7 @@ from tilestream.pipeline.stages.map_plan import MapPlan, apart
 from tilestream.pipeline.stages.observe import Observing, observe, observe_task
 from tilestream.records import Route, RouteZ
 from tilestream.sensor import VLP16, Carrier, Sensor
-from tilestream.settings import LabelSettings, VirtualSettings
+from tilestream.settings import DEFAULT_MEMORY, LabelSettings, VirtualSettings
 from tilestream.store import TileStore
 from tilestream.tables import read_tables
 

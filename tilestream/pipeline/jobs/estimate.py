@@ -12,11 +12,11 @@ from tilestream.matcher import RegistrationSettings
 from tilestream.model.registry import UNTRAINED
 from tilestream.model.shipped import SHIPPED, is_shipped
 from tilestream.pipeline.engine.executor import Watch
-from tilestream.pipeline.engine.plan import DEFAULT_MEMORY
 from tilestream.pipeline.jobs.run import run
 from tilestream.pipeline.jobs.run_settings import ModelSettings, RunSettings
 from tilestream.sensor import VLP16, Carrier
 from tilestream.settings import (
+    DEFAULT_MEMORY,
     PREDICTION_ERROR,
     CoarseSettings,
     LabelSettings,

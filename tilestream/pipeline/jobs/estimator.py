@@ -1,6 +1,6 @@
 """What makes the estimates of a run: a model that is there, one trained here, the virtual drive."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from tilestream.errors import ModelError
@@ -14,6 +14,12 @@ from tilestream.pipeline.jobs.run_settings import RunSettings
 
 LABELS = "labels"
 """What it is filed under that there are too few labels to train on."""
+
+OTHER_LIDAR = "of another lidar than the vehicle's"
+UNFIT = "which does not fit the map"
+"""Why a drive may train nothing."""
+NONE_ASIDE: Mapping[str, str] = {}
+"""All drives train."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +39,9 @@ class Estimator:
         return self.use is None and not self.trained
 
 
-def estimator_of(settings: RunSettings, labelled: int, otherwise: Sequence[str] = ()) -> Estimator:
+def estimator_of(
+    settings: RunSettings, labelled: int, aside: Mapping[str, str] = NONE_ASIDE
+) -> Estimator:
     """What makes the estimates, as soon as it is known how many places are measured.
 
     With too few of them to train on, the model that ships does, if it fits the job; else the
@@ -41,8 +49,8 @@ def estimator_of(settings: RunSettings, labelled: int, otherwise: Sequence[str] 
 
     Args:
         settings: the job.
-        labelled: how many places are measured, as the vehicle's lidar.
-        otherwise: the drives that are read as another one, and so train nothing.
+        labelled: how many places are measured that may train.
+        aside: the drives that train nothing, and why, in words.
     """
     model = settings.model
     if model.use is not None:
@@ -52,8 +60,8 @@ def estimator_of(settings: RunSettings, labelled: int, otherwise: Sequence[str] 
     if labelled >= POINTS_MIN or settings.observe is None:
         return Estimator(trained=True)
     few = f"{labelled} labels, {POINTS_MIN} are needed to train {model.recipe}"
-    if otherwise:
-        few += f" (not counted: {', '.join(otherwise)}, of another lidar than the vehicle's)"
+    if aside:
+        few += f" (not counted: {'; '.join(f'{name}, {why}' for name, why in aside.items())})"
     more = "to train, measure longer drives, or more of them, or places nearer to each other; "
     more += WITHOUT_DRIVES
     unfit = _unfit(settings)

@@ -9,7 +9,7 @@ from tilestream.notes import MATCHER, Notes, noticed
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.stage import Task
 from tilestream.pipeline.jobs.along_routes import off_map
-from tilestream.pipeline.jobs.estimator import estimator_of
+from tilestream.pipeline.jobs.estimator import OTHER_LIDAR, estimator_of
 from tilestream.pipeline.jobs.ingest import plan_ingest
 from tilestream.pipeline.jobs.map_expected import tiles_to_read
 from tilestream.pipeline.jobs.rounds import first_round
@@ -72,12 +72,12 @@ def forecast(settings: RunSettings) -> Forecast:
     map_plan, reading, notes, sources = _expected_map(settings, inputs)
     inputs = with_logs(settings, inputs, sources)
     measure = plan_measure(settings, inputs, map_plan)
-    otherwise = seen_otherwise(settings, inputs.drives)
+    aside = dict.fromkeys(seen_otherwise(settings, inputs.drives), OTHER_LIDAR)
     labels = measure.outputs("label")
-    by = estimator_of(settings, places_to_train(labels, otherwise), otherwise)
+    by = estimator_of(settings, places_to_train(labels, aside), aside)
     rounds, measure = first_round(settings, map_plan, measure, by)
     done = [Outcome(task.key, task.stage) for task in measure.tasks]
-    estimate = plan_estimate(settings, map_plan.store.grid, measure, done, by, otherwise=otherwise)
+    estimate = plan_estimate(settings, map_plan.store.grid, measure, done, by, aside=aside)
     tasks = (*reading, *measure.tasks, *estimate.tasks)
     far = {"routes": off_map(map_plan.points, map_plan.store.grid, inputs.routes)}
     lost = [f"{name} is left out: {reason}" for name, reason in measure.left_out.items()]

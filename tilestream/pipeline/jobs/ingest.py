@@ -18,10 +18,9 @@ from tilestream.errors import (
 from tilestream.formats.logs import ScanSelection
 from tilestream.lock import only_writer
 from tilestream.pipeline.engine.executor import Watch, execute
-from tilestream.pipeline.engine.plan import DEFAULT_MEMORY
 from tilestream.pipeline.jobs.map_reading import GONE, MADE_BY, Reading, remembered
 from tilestream.pipeline.jobs.sources import Source, examine_all, with_crs, within
-from tilestream.settings import IngestSettings, LogOptions
+from tilestream.settings import DEFAULT_MEMORY, IngestSettings, LogOptions
 from tilestream.store import StoreSettings, TileStore, open_store
 
 logger = logging.getLogger(__name__)

@@ -26,7 +26,7 @@ from tilestream.label import start_poses
 from tilestream.matcher import RegistrationSettings
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.engine.outputs import Parquet
-from tilestream.pipeline.engine.plan import DEFAULT_MEMORY, Plan, paths_of
+from tilestream.pipeline.engine.plan import Plan, paths_of
 from tilestream.pipeline.engine.stage import Task
 from tilestream.pipeline.jobs.inventory import make_tables
 from tilestream.pipeline.jobs.overlap import Overlap, overlap
@@ -35,7 +35,7 @@ from tilestream.pipeline.stages.label import label
 from tilestream.pipeline.stages.map_plan import MapPlan, apart
 from tilestream.pipeline.stages.register import MARGIN, Measuring, register
 from tilestream.records import Float64, Int64, TruePose
-from tilestream.settings import LabelSettings, StartSettings
+from tilestream.settings import DEFAULT_MEMORY, LabelSettings, StartSettings
 from tilestream.store import TileStore
 from tilestream.tables import read_tables
 

@@ -40,7 +40,13 @@ from tilestream.pipeline.jobs.run_book import (
     told_before,
     write_text,
 )
-from tilestream.pipeline.jobs.run_findings import Done, findings_of, heights_told, offset_told
+from tilestream.pipeline.jobs.run_findings import (
+    Done,
+    findings_of,
+    heights_told,
+    offset_told,
+    without,
+)
 from tilestream.pipeline.jobs.run_inputs import (
     JOB,
     Inputs,
@@ -208,12 +214,14 @@ def _report(settings: RunSettings, inputs: Inputs, story: Story, book: Book) -> 
         return
     by, otherwise = story.estimator, story.otherwise
     told = (
-        {JOB: offset_told(places_to_train(done.outputs("label"), otherwise), settings, by)},
+        {JOB: offset_told(places_to_train(done.outputs("label"), story.aside), settings, by)},
         heights_told(done, settings),
         log_poses_told(done),
     )
     book.facts["notes"] = noticed(book.facts["notes"], *told)
-    known = done.dataset()
+    known = without(done.dataset(), story.unfit)
+    if story.unfit:
+        book.facts["unfit"] = dict(story.unfit)
     if known is not None:
         book.facts |= {"labelled": len(known), "lost_labels": known.losses}
     found, evaluation = findings_of(

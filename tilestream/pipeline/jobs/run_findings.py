@@ -235,11 +235,11 @@ def ceilings(dataset: Dataset | None, targets: Sequence[str]) -> dict[str, dict[
     return found
 
 
-def _without(dataset: Dataset | None, otherwise: Collection[str]) -> Dataset | None:
+def without(dataset: Dataset | None, groups: Collection[str]) -> Dataset | None:
     """The dataset without these groups; None: nothing is left."""
-    if dataset is None or not otherwise:
+    if dataset is None or not groups:
         return dataset
-    left = [name for name in dataset.rows["group"].unique() if name not in otherwise]
+    left = [name for name in dataset.rows["group"].unique() if name not in groups]
     return dataset.groups(left) if left else None
 
 
@@ -267,7 +267,7 @@ def findings_of(
     points = with_intervals(held) if isinstance(held, pd.DataFrame) else _NO_POINTS
     weights = paths_of(done.outputs("importance"))
     weighed = read_tables(weights) if weights else pd.DataFrame({"factor": []})
-    ceiling_of = ceilings(_without(dataset, otherwise), TARGETS)
+    ceiling_of = ceilings(without(dataset, otherwise), TARGETS)
     labels = labels_of(
         None if dataset is None else dataset.averaged(done.width),
         places,

@@ -10,7 +10,6 @@ from tilestream.errors import SourceError
 from tilestream.model.dataset import Dataset
 from tilestream.model.join import KEPT_BY, NOT_A_NUMBER
 from tilestream.notes import MATCHER, noticed
-from tilestream.pipeline.engine.outputs import Parquet
 from tilestream.pipeline.jobs.along_routes import off_map
 from tilestream.pipeline.jobs.drive_measured import to_measure, with_labels
 from tilestream.pipeline.jobs.localize import drive_overlap
@@ -23,6 +22,7 @@ from tilestream.pipeline.jobs.run_inputs import (
 )
 from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.jobs.sources import map_notes, scans_of
+from tilestream.pipeline.jobs.unfit import labels_by_drive
 from tilestream.pipeline.stages.drive_scans import opened
 from tilestream.pipeline.stages.label import label
 from tilestream.report.drives import DriveMeasured
@@ -93,7 +93,7 @@ def _on_degraded(settings: RunSettings, inputs: Inputs) -> list[str]:
 
 def drives_measured(inputs: Inputs, done: Done) -> tuple[DriveMeasured, ...]:
     """How much of each drive was measured."""
-    tables = _labels_by_drive(done)
+    tables = labels_by_drive(done.outputs(label.name))
     return tuple(
         with_labels(drive, tables.get(drive.drive, NO_ROWS)) for drive in inputs.to_measure
     )
@@ -101,17 +101,8 @@ def drives_measured(inputs: Inputs, done: Done) -> tuple[DriveMeasured, ...]:
 
 def log_poses_told(done: Done) -> dict[str, list[str]]:
     """How far the logs' poses are from refined ones, by drive."""
-    tables = _labels_by_drive(done)
+    tables = labels_by_drive(done.outputs(label.name))
     return {f"drive {name}": note_of_log_poses(rows) for name, rows in tables.items()}
-
-
-def _labels_by_drive(done: Done) -> dict[str, pd.DataFrame]:
-    tables: dict[str, list[pd.DataFrame]] = {}
-    for task in done.outputs(label.name):
-        assert isinstance(task.writes, Parquet)
-        group = task.writes.path.rsplit("/", 2)[1]
-        tables.setdefault(group, []).append(task.writes.read().rows)
-    return {name: pd.concat(parts, ignore_index=True) for name, parts in tables.items()}
 
 
 def lost_labels(dataset: Dataset | None) -> list[dict[str, Any]]:

@@ -21,7 +21,7 @@ from tilestream.pipeline.engine.outputs import Parquet
 from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.engine.stage import Readable, Task
 from tilestream.pipeline.jobs.along_routes import plan_factors, plan_observe, samples_along
-from tilestream.pipeline.jobs.estimator import Estimator, estimator_of
+from tilestream.pipeline.jobs.estimator import NONE_ASIDE, Estimator, estimator_of
 from tilestream.pipeline.jobs.localize import labelled_places, plan_localize
 from tilestream.pipeline.jobs.prediction_tasks import model_there, prediction_tasks, products
 from tilestream.pipeline.jobs.run_inputs import (
@@ -165,7 +165,7 @@ def plan_estimate(
     outcomes: Sequence[Outcome],
     estimator: Estimator | None = None,
     between: Mapping[TileKey, Between] | None = None,
-    otherwise: Sequence[str] = (),
+    aside: Mapping[str, str] = NONE_ASIDE,
 ) -> Plan:
     """Samples, evaluate, train, predict: from what was measured.
 
@@ -180,8 +180,7 @@ def plan_estimate(
         outcomes: what became of it.
         estimator: what makes the estimates; None: by how many places were measured.
         between: by tile, where a coarse run interpolates.
-        otherwise: the drives that are read as another lidar than the vehicle's: they are measured,
-            and train nothing.
+        aside: the drives that are measured and train nothing, and why, in words.
     """
     done = {outcome.key for outcome in outcomes if outcome.ok}
     factors, observed, labels = (
@@ -191,7 +190,7 @@ def plan_estimate(
     blind = {task.tile for task in measure.outputs("observe") if task.key not in done}
     factors = [task for task in factors if task.tile not in blind]
     tasks: list[Task] = []
-    estimator = estimator or estimator_of(settings, places_to_train(labels, otherwise), otherwise)
+    estimator = estimator or estimator_of(settings, places_to_train(labels, aside), aside)
     known = not estimator.trained
     model: Readable | None = model_there(estimator)
     if labels and factors:
@@ -199,7 +198,7 @@ def plan_estimate(
         joined = _samples(settings, factors, of_drives, labels)
         tasks.append(joined)
         if not known:
-            learns = _of_vehicle(joined, labels, otherwise)
+            learns = _learnt_from(joined, labels, aside)
             training = _training(settings, joined, learns)
             known, model = True, training.product
             tasks += [training, *_evaluations(settings, joined, learns, bool(observed))]
@@ -243,17 +242,17 @@ def _samples(
     )
 
 
-def places_to_train(labels: Iterable[Task], otherwise: Collection[str]) -> int:
-    """How many places these tasks measure, without those of another lidar than the vehicle's."""
-    return sum(task.work for task in labels if _group(task) not in otherwise)
+def places_to_train(labels: Iterable[Task], aside: Collection[str]) -> int:
+    """How many places these tasks measure, without drives that train nothing."""
+    return sum(task.work for task in labels if _group(task) not in aside)
 
 
-def _of_vehicle(joined: Task, labels: Sequence[Task], otherwise: Collection[str]) -> Readable:
-    """What is learnt from: of the joined dataset the drives read as the vehicle's lidar."""
-    if not otherwise:
+def _learnt_from(joined: Task, labels: Sequence[Task], aside: Collection[str]) -> Readable:
+    """What is learnt from: of the joined dataset the drives that are not aside."""
+    if not aside:
         return joined.product
     groups = dict.fromkeys(map(_group, labels))
-    return DrivesOf(joined.product, tuple(name for name in groups if name not in otherwise))
+    return DrivesOf(joined.product, tuple(name for name in groups if name not in aside))
 
 
 def _group(task: Task) -> str:

@@ -16,7 +16,13 @@ from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.late_client import client_for
 from tilestream.pipeline.engine.plan import Plan, paths_of
 from tilestream.pipeline.engine.stage import Task
-from tilestream.pipeline.jobs.estimator import LABELS, Estimator, estimator_of
+from tilestream.pipeline.jobs.estimator import (
+    LABELS,
+    OTHER_LIDAR,
+    UNFIT,
+    Estimator,
+    estimator_of,
+)
 from tilestream.pipeline.jobs.inventory import announce, withdraw
 from tilestream.pipeline.jobs.map_reading import GONE, Reading
 from tilestream.pipeline.jobs.map_update import Update
@@ -27,6 +33,7 @@ from tilestream.pipeline.jobs.run_inputs import Inputs, read_map, seen_otherwise
 from tilestream.pipeline.jobs.run_notes import with_logs
 from tilestream.pipeline.jobs.run_plan import places_to_train, plan_estimate, plan_measure
 from tilestream.pipeline.jobs.run_settings import RunSettings
+from tilestream.pipeline.jobs.unfit import unfit_drives
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.store import TileStore, open_store
 
@@ -66,6 +73,8 @@ class Story:
         """Those of a coarse run; None: all places are evaluated."""
         self.otherwise = seen_otherwise(settings, self.inputs.drives)
         """The drives that are read as another lidar than the vehicle's, and so train nothing."""
+        self.unfit: dict[str, str] = {}
+        """Those that do not fit the map and train nothing either, and why: known when measured."""
         self._tiles: set[str] = set()
         self._open: set[str] = set()
         self._early = _Early((), set())
@@ -78,6 +87,11 @@ class Story:
     def places(self) -> int:
         """How many sample points the routes have."""
         return sum(task.work for task in self.measure.outputs("factors"))
+
+    @property
+    def aside(self) -> dict[str, str]:
+        """The drives that train nothing, and why, in words."""
+        return dict.fromkeys(self.otherwise, OTHER_LIDAR) | dict.fromkeys(self.unfit, UNFIT)
 
     @property
     def files(self) -> list[str]:
@@ -145,7 +159,9 @@ class Story:
         """What is to be done when all is measured."""
         good = {outcome.key for outcome in self.book.outcomes if outcome.ok}
         labels = [task for task in self.measure.outputs("label") if task.key in good]
-        self._decide(places_to_train(labels, self.otherwise))
+        self.unfit = unfit_drives(labels)
+        self.book.failures |= {f"drive {name}": why for name, why in self.unfit.items()}
+        self._decide(places_to_train(labels, self.aside))
         planned = self._plan(self.book.outcomes)
         joined = planned.outputs("samples")
         if not (self.estimator.trained and joined):
@@ -164,11 +180,11 @@ class Story:
         """How many places are joined that a model may learn from."""
         joined = next(task for task in self.book.tasks if task.key == self._joining)
         groups = joined.writes.read().rows["group"]
-        return int((~groups.isin(self.otherwise)).sum())
+        return int((~groups.isin(list(self.aside))).sum())
 
     def _decide(self, labelled: int) -> None:
         """What makes the estimates, with so many places to learn from."""
-        self.estimator = estimator_of(self.settings, labelled, self.otherwise)
+        self.estimator = estimator_of(self.settings, labelled, self.aside)
 
     def _rest(self, planned: Plan) -> tuple[Task, ...]:
         """What of the whole plan has not been given out."""
@@ -196,7 +212,7 @@ class Story:
             outcomes,
             self.estimator,
             between,
-            self.otherwise,
+            self.aside,
         )
 
     def _close_map(self) -> None:
@@ -213,7 +229,7 @@ class Story:
             keep_before(self.settings)
         self.measure = plan_measure(self.settings, self.inputs, map_plan)
         self.book.failures |= self.measure.left_out
-        self._decide(places_to_train(self.measure.outputs("label"), self.otherwise))
+        self._decide(places_to_train(self.measure.outputs("label"), self.aside))
         self.rounds, self.measure = first_round(
             self.settings, map_plan, self.measure, self.estimator
         )
