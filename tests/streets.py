@@ -24,9 +24,10 @@ def street(kind: str, seed: int, spacing: float) -> np.ndarray:
     return in_map(points, (STREETS[kind], 0.0, 0.0))
 
 
-def write_drive(path: Path, kind: str) -> Path:
+def write_drive(path: Path, kind: str, off: float = 0.0) -> Path:
+    """The log of a drive whose poses are so far off to the side [m]."""
     messages: list[logs.Message] = []
-    seen = street(kind, 100, 0.7)
+    seen = street(kind, 100, 0.7) + np.array([0.0, off, 0.0])
     for i in range(SCANS):
         T_map_lidar = pose(x=STREETS[kind] + 8.0 + i, y=0.1 * np.sin(i), z=2.0)
         stamp = START + i * SECOND

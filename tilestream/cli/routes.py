@@ -32,6 +32,7 @@ from tilestream.pipeline.jobs import localize as localize_drive
 from tilestream.pipeline.jobs.drive_measured import drive_measured
 from tilestream.pipeline.jobs.run_inputs import reading_of
 from tilestream.pipeline.jobs.sources import map_notes, scans_of
+from tilestream.pipeline.jobs.unfit import unfit
 from tilestream.pipeline.stages.drive_scans import opened as opened_log
 from tilestream.pipeline.stages.factors import Looking
 from tilestream.pipeline.stages.map_plan import MapPlan
@@ -166,13 +167,16 @@ def _require_measured(labels: pd.DataFrame, drive: DriveMeasured) -> None:
 
     Raises:
         PartialError: some scans failed; lists them.
-        LimitError: less than `EVALUATED` of what was selected was evaluated.
+        LimitError: less than `EVALUATED` of what was selected was evaluated, or the drive does not
+            fit the map.
     """
     failed = labels[labels["status"] != "done"]
     if len(failed):
         reasons = {f"scan {s}": r for s, r in zip(failed["scan"], failed["reason"], strict=True)}
         told = f"{drive.drive}: {len(failed)} of {len(labels)} scans failed:"
         raise PartialError(told, reasons)
+    if why := unfit(labels):
+        raise LimitError(f"{drive.drive}: {why}")
     if not drive.evaluated:
         raise LimitError(
             f"{drive.drive}: {drive}: less than {EVALUATED:.0%} of what was selected was "

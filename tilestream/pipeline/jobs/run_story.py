@@ -160,7 +160,8 @@ class Story:
         good = {outcome.key for outcome in self.book.outcomes if outcome.ok}
         labels = [task for task in self.measure.outputs("label") if task.key in good]
         self.unfit = unfit_drives(labels)
-        self.book.failures |= {f"drive {name}": why for name, why in self.unfit.items()}
+        for name, why in self.unfit.items():
+            self.book.failures[f"drive {name}"] = f"{why} Nothing is learnt from it or judged by it"
         self._decide(places_to_train(labels, self.aside))
         planned = self._plan(self.book.outcomes)
         joined = planned.outputs("samples")

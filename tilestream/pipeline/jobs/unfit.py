@@ -9,15 +9,16 @@ from tilestream.pipeline.engine.stage import Task
 
 NVTL = 2.3
 """Autoware takes a pose whose NVTL is below this as not converged (its ndt_scan_matcher)."""
-MOST = 0.5
-"""Share of the starts near the true pose that fail, from which on most do."""
+MANY = 0.2
+"""Share of the starts near the true pose that fail, from which on many do."""
 
 
 def unfit(rows: pd.DataFrame) -> str:
     """Why the labels of a drive tell nothing of the map; empty: they do.
 
-    At half of its places or more, most of the starts near the true pose leave it, and where they
-    end scan and map do not agree: a hard street has the one and not the other.
+    At half of its places or more, many of the starts near the true pose leave it, and where they
+    end scan and map do not agree: a hard street has the one and not the other (of 40 drives, real
+    and simulated, of lidars down to 15 m, the lowest median is 3.0, and 6 % of near starts fail).
 
     Args:
         rows: of the label table of one drive.
@@ -26,13 +27,13 @@ def unfit(rows: pd.DataFrame) -> str:
     if there.empty:
         return ""
     fail, agree = (float(there[name].median()) for name in ("near_p_fail", "near_nvtl"))
-    if not (fail >= MOST and agree < NVTL):
+    if not (fail >= MANY and agree < NVTL):
         return ""
     return (
         f"it does not fit the map: at half of its {len(there):,} places {fail:.0%} or more of the "
         f"starts near the true pose end more than 0.5 m off, where scan and map do not agree (NVTL "
         f"{agree:.1f}; {NVTL} is the least that Autoware takes): is it of this map, are its poses "
-        "in the map's frame? Nothing is learnt from it or judged by it"
+        "in the map's frame?"
     )
 
 
