@@ -155,6 +155,8 @@ def test_a_job_that_would_label_with_its_map_is_refused_before_it_runs(
     ts.run(allowed)
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     assert any("their errors are too small" in note for note in record["notes"][log])
+    worth = json.loads((tmp_path / "run" / "report" / "report.json").read_text())["worth"]
+    assert worth["warnings"][0].startswith("The map was made of scans that drives were measured")
 
 
 def test_a_drive_that_is_not_where_its_map_is(store: str, tmp_path: Path) -> None:

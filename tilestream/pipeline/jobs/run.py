@@ -232,6 +232,7 @@ def _report(settings: RunSettings, inputs: Inputs, story: Story, book: Book) -> 
         settings,
         by,
         otherwise,
+        inputs.mapped,
     )
     found = replace(
         found,

@@ -135,6 +135,16 @@ def offset_told(labelled: int, settings: RunSettings, estimator: Estimator) -> l
     return [f"{told} virtual drive as it is (model.offset 0)."]
 
 
+def mapped_told(mapped: Sequence[str]) -> str:
+    """A warning of drives of which scans are in the map; empty: there are none."""
+    if not mapped:
+        return ""
+    return (
+        f"The map was made of scans that drives were measured with ({', '.join(mapped)}): these "
+        "errors are too small, and so is what is learnt of them or checked by them."
+    )
+
+
 def labels_of(
     dataset: Dataset | None,
     places: pd.DataFrame,
@@ -251,10 +261,12 @@ def findings_of(
     settings: RunSettings,
     estimator: Estimator,
     otherwise: Collection[str],
+    mapped: Sequence[str] = (),
 ) -> tuple[Findings, dict[str, Any]]:
     """All that the report tells, and the figures of the evaluation for machines.
 
-    `otherwise` are the groups of labels that were seen with another lidar than the vehicle's.
+    `otherwise` are the groups of labels that were seen with another lidar than the vehicle's,
+    `mapped` those of which scans are in the map.
     Held-out estimates are those of the model's own recipe, and there are none where no path could
     be left out; of a model that was not trained on these labels all estimates are held out as they
     are.
@@ -276,8 +288,9 @@ def findings_of(
         otherwise,
         (model.offset or 0.0) if estimator.untrained else None,
     )
-    coarse = str(facts.get("coarse", {}).get("told", ""))
-    worth = _worth(done, settings, estimator, (places, labels, tables["protocols"]), coarse)
+    told = (estimator.few, mapped_told(mapped), str(facts.get("coarse", {}).get("told", "")))
+    warnings = [warning for warning in told if warning]
+    worth = _worth(done, settings, estimator, (places, labels, tables["protocols"]), warnings)
     own = labels if labels.empty else labels[~labels["group"].isin(list(otherwise))]
     places = with_measured(places, own, 0.5 * settings.spacing + ROUNDING)
     gathered = Findings(
@@ -341,10 +354,10 @@ def _worth(
     settings: RunSettings,
     estimator: Estimator,
     tables: tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame],
-    coarse: str,
+    warnings: Sequence[str],
 ) -> Worth:
-    """What the estimates are worth, from places, labels, the figures by protocol, and what a coarse
-    run tells of itself.
+    """What the estimates are worth, from places, labels, the figures by protocol, and what warns of
+    them.
     """
     places, labels, protocols = tables
     model, own = None, settings.model.recipe
@@ -372,8 +385,7 @@ def _worth(
         blocks=of_blocks[0] if of_blocks else None,
         simulated=settings.simulate is not None,
         shipped=estimator.use == SHIPPED,
-        few=estimator.few,
-        coarse=coarse,
+        warnings=warnings,
     )
 
 

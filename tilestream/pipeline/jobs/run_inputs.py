@@ -65,6 +65,8 @@ class Inputs:
     """Which routes are left out, and why."""
     to_measure: tuple[DriveMeasured, ...] = ()
     """The scans of each drive, as soon as its log is opened."""
+    mapped: tuple[str, ...] = ()
+    """The drives of which scans that are measured are in the map."""
     attributions: tuple[str, ...] = ()
     """Whose data it is."""
 

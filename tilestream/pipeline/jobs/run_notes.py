@@ -48,7 +48,7 @@ def with_logs(
         UsageError: scans that are to be localized are in the map, and not `allow_overlap`.
     """
     notes: list[dict[str, list[str]]] = []
-    found = []
+    found, mapped = [], []
     for drive in inputs.drives:
         reading, scans, spacing = reading_of(drive), scans_of(drive), settings.spacing
         several = settings.label.scans_per_point
@@ -61,7 +61,9 @@ def with_logs(
             shared.require_none()
         notes.append({drive.log: [*log.notes, *shared.notes]})
         found.append(to_measure(drive.group, log, scans, spacing, several))
-    return replace(inputs, notes=noticed(inputs.notes, *notes), to_measure=tuple(found))
+        mapped += [drive.group] if shared.mapped else []
+    notes_of = noticed(inputs.notes, *notes)
+    return replace(inputs, notes=notes_of, to_measure=tuple(found), mapped=tuple(mapped))
 
 
 def run_notes(settings: RunSettings, inputs: Inputs, store: TileStore) -> dict[str, list[str]]:

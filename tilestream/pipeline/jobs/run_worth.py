@@ -39,8 +39,7 @@ def worth_of(
     blocks: Mapping[str, Any] | None = None,
     simulated: bool = False,
     shipped: bool = False,
-    few: str = "",
-    coarse: str = "",
+    warnings: Sequence[str] = (),
 ) -> Worth:
     """What the estimates of a run are worth.
 
@@ -53,8 +52,7 @@ def worth_of(
         blocks: of a model that was trained here, how it estimates held-out blocks (`Figures`).
         simulated: whether city and drives of the run are simulated.
         shipped: whether it came with tilestream.
-        few: why nothing was trained here, where something was to be.
-        coarse: of a coarse run, how many places are interpolated, and how far off.
+        warnings: why to trust them less, besides what the model itself tells.
     """
     estimate = estimates(places)
     at = _median_place(estimate)
@@ -72,7 +70,7 @@ def worth_of(
         **_ends(places, at),
         outside=int((like == "no").sum()) / compared if compared else None,
         **trained,
-        warnings=(*([few] if few else []), *([coarse] if coarse else []), *_small(trained)),
+        warnings=(*warnings, *_small(trained)),
     )
 
 
