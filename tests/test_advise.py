@@ -13,6 +13,7 @@ from scenes import PLACES
 
 import tilestream as ts
 from tilestream.apps import advise as advising
+from tilestream.apps.advise import OF_REMEDIES
 from tilestream.apps.choices import Choice
 from tilestream.apps.remedies import FIRST_GUESS, remedies_of
 from tilestream.cli import run as command
@@ -172,9 +173,12 @@ def test_the_command_says_the_same_in_words_and_for_machines(run: Path, capsys: 
     first = told["stretches"][0]
     assert first["now_m"] == found.stretches["now_m"][0]
     assert len(first["remedies"]) == found.remedies["remedy"].nunique()
+    report = json.loads((run / "report" / "report.json").read_text())
+    assert told["worth"] == list(found.worth) == [*report["worth"]["told"], OF_REMEDIES]
     assert command(line) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert first["verdict"] in said
+    assert found.worth[0] in said
     assert FIRST_GUESS in said
     assert command(["advise", str(run), "--threshold", "50"]) == 0
     assert "nothing to mend" in capsys.readouterr().out

@@ -373,7 +373,8 @@ def test_the_command_compares_and_explains_itself(
         "short-12m-cell2m",
     ]
     assert told["facts"]["matcher"] == "autoware"
-    assert (tmp_path / "out" / "compare.html").is_file()
+    assert any("without a model" in sentence for sentence in told["worth"]["told"])
+    assert told["worth"]["told"][0] in (tmp_path / "out" / "compare.html").read_text()
     assert run([*line, "--spacing", "16"]) == 0
     shown = capsys.readouterr().out
     assert "short-12m-cell2m" in shown

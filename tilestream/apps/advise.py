@@ -11,7 +11,7 @@ import pandas as pd
 
 from tilestream.apps.choices import choice_tasks, tables_by_choice
 from tilestream.apps.remedies import FIRST_GUESS, remedies_of
-from tilestream.apps.runs import places_of, settings_of
+from tilestream.apps.runs import places_of, settings_of, worth_of
 from tilestream.errors import PartialError, SourceNotFoundError, UsageError, counted
 from tilestream.factors.rows import samples_of_places
 from tilestream.files import Files
@@ -32,6 +32,11 @@ MOST = 5
 CLEAR = 2.0
 """A remedy helps where the virtual drive is better by more than so many standard errors of the
 difference."""
+OF_REMEDIES = (
+    "With a remedy it is the estimate times what a virtual drive gains by it at up to "
+    f"{MOST} places of a stretch; no remedy was measured on a drive."
+)
+"""What the figures of remedies are worth."""
 PLACE = ["route_id", "sample"]
 OF_DRIVE = ["vd_mean", "vd_mean_sd", "vd_floor", "vd_floor_sd", "vd_draws"]
 STRETCH = (
@@ -58,6 +63,8 @@ class Advice:
     """Remedies that are not tried, and why."""
     threshold: float
     """Of the estimate [m]."""
+    worth: tuple[str, ...] = ()
+    """What the figures are worth, as sentences."""
 
 
 def advise(
@@ -124,7 +131,8 @@ def advise(
             raise PartialError(told, failures)
         tables = tables_by_choice(plan.outputs(observe.name))
         seen |= {name: read_tables(tables[choice.name]) for name, choice in tried.items()}
-    return _advice(places, poor, looked_at, seen, left_out, threshold)
+    found = _advice(places, poor, looked_at, seen, left_out, threshold)
+    return replace(found, worth=(*worth_of(place), OF_REMEDIES))
 
 
 def _known(place: str | os.PathLike[str]) -> pd.DataFrame:

@@ -21,6 +21,8 @@ from tilestream.errors import PartialError, counted
 from tilestream.factors.rows import in_route_order
 from tilestream.grid import MM_PER_M, whole_mm
 from tilestream.matcher import RegistrationSettings
+from tilestream.model.file import load_model
+from tilestream.model.shipped import SHIPPED, file_of, is_shipped
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.jobs.along_routes import SENSOR_HEIGHT, samples_along
@@ -122,7 +124,25 @@ def compare(
         **{f"seeing.{name}": value for name, value in seeing.model_dump(exclude=own).items()},
     }
     table = choice_table(choices, registration)
-    return Comparison(rows, table, cells_of_map(plan, store), facts)
+    return Comparison(rows, table, cells_of_map(plan, store), facts, worth=worth_told())
+
+
+def worth_told() -> tuple[str, ...]:
+    """What the errors of virtual drives are worth, as sentences; what was checked on real drives
+    is told by the card of the model that ships, which rests on them.
+    """
+    told = "These are errors of virtual drives as they are, from the map alone, without a model: "
+    told += "they tell choices apart; how large the error is, is not checked here."
+    if not is_shipped():
+        return (told,)
+    real = load_model(file_of(SHIPPED)).card.get("checked", {}).get("real drives", {})
+    if "spearman" not in real:
+        return (told,)
+    middle, low, high = real["spearman"]
+    there = f"{real['places']} places, {real['drives']} drives"
+    checked = f"On real drives elsewhere ({there}) estimates that rest on them had a rank "
+    checked += f"correlation of {middle:.2f} ({low:.2f} to {high:.2f}) with what was measured."
+    return told, checked
 
 
 def plan_compare(

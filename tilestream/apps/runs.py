@@ -43,6 +43,8 @@ from tilestream.report.formatting import CM_PER_M
 from tilestream.store import TileStore
 from tilestream.tables import read_tables
 
+REPORT = "report/report.json"
+"""The figures of the report of a run that has ended, in its directory."""
 PLACES = "report/places.parquet"
 """The places of a run that has ended, in its directory."""
 PLACE = [column.name for column in PLACE_COLUMNS]
@@ -108,6 +110,20 @@ def crs_of_map(place: str | os.PathLike[str]) -> str | None:
         return map_of(place).settings.crs
     except StoreNotFoundError:
         return None
+
+
+def worth_of(place: str | os.PathLike[str]) -> list[str]:
+    """What the estimates of a run are worth, as its report says it; nothing: there is none yet.
+
+    Raises:
+        DamagedError: the report is not what was written.
+    """
+    folder = Files.at(place)
+    report, record = folder.under(REPORT), told_before(folder.under(RECORD))
+    if not report.there() or record.get("state") not in ENDED:
+        return []
+    worth = json.loads(content_as_written(report, record, REPORT))["worth"]
+    return list(worth["told"]) if worth else []
 
 
 def places_of(place: str | os.PathLike[str]) -> pd.DataFrame:

@@ -11,11 +11,14 @@ from tilestream.apps.runs import settings_of
 from tilestream.cli.cluster import HERE, Cluster, on_cluster
 from tilestream.cli.fields import fields, with_settings
 from tilestream.cli.options import AsJson
-from tilestream.cli.printing import out, print_json, say
+from tilestream.cli.printing import out, print_json, say, show_worth
 from tilestream.cli.progress import progress
-from tilestream.report.formatting import cm, distance
+from tilestream.report.formatting import cm, cm_about, distance
 from tilestream.report.summary import plain
 from tilestream.settings import DEFAULT_MEMORY, ReportSettings
+
+DIGITS = 2
+"""Significant digits of an estimate with a remedy."""
 
 
 @on_cluster
@@ -45,9 +48,12 @@ def advise(
     if found.stretches.empty:
         say(f"No estimate is above {cm(found.threshold, 0)}: there is nothing to mend")
         return
+    show_worth({"told": found.worth})
     out.print(advice_table(found))
     for row in found.stretches.to_dict("records"):
-        say(f"{row['route']}, {row['begin_m']:.0f} to {row['end_m']:.0f} m: {verdict(found, row)}")
+        begin, end = (f"{row[name]:.0f}" for name in ("begin_m", "end_m"))
+        where = f"at {begin}" if begin == end else f"{begin} to {end}"
+        say(f"{row['route']}, {where} m: {verdict(found, row)}")
     for name, why in found.left_out.items():
         say(f"Not tried: {name}, {why}")
 
@@ -62,6 +68,7 @@ def content_of(found: advising.Advice) -> dict[str, Any]:
         for of in [found.remedies[found.remedies["stretch"] == number]]
     ]
     content = {"threshold_m": found.threshold, "stretches": stretches, "not_tried": found.left_out}
+    content |= {"worth": list(found.worth)}
     return dict(plain(content))
 
 
@@ -72,7 +79,7 @@ def verdict(found: advising.Advice, row: Any) -> str:
             "none of these helps clearly: the lidar does not tell the position here, other sensors "
             "have to"
         )
-    change = f"{row['best']}: {cm(row['now_m'], 0)} to {cm(row['best_m'], 0)}"
+    change = f"{row['best']}: {cm_about(row['now_m'], DIGITS)} to {cm_about(row['best_m'], DIGITS)}"
     limit = cm(found.threshold, 0)
     told = f"{change}, {'within' if row['mends'] else 'still over'} {limit}"
     return " ".join(told.split())  # plain spaces
@@ -91,8 +98,8 @@ def advice_table(found: advising.Advice) -> Table:
     table.add_column("")
     for number, row in enumerate(found.stretches.to_dict("records")):
         where = (str(row["route"]), f"{row['begin_m']:.0f} m", distance(row["length_m"]))
-        table.add_row(*where, "as it is", cm(row["now_m"], 0), "")
+        table.add_row(*where, "as it is", cm_about(row["now_m"], DIGITS), "")
         for one in found.remedies[found.remedies["stretch"] == number].to_dict("records"):
             clear = "" if one["helps"] else "unclear"
-            table.add_row("", "", "", str(one["remedy"]), cm(one["after_m"], 0), clear)
+            table.add_row("", "", "", str(one["remedy"]), cm_about(one["after_m"], DIGITS), clear)
     return table

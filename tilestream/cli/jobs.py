@@ -14,7 +14,7 @@ from tilestream.cli.cluster import ALL_CORES, HERE, AllCores, Cluster, on_cluste
 from tilestream.cli.fields import fields, options_named, with_settings
 from tilestream.cli.options import AsJson, Changes, Config, DryRun
 from tilestream.cli.plans import forecast_table, plan_table
-from tilestream.cli.printing import err, out, print_json, say, say_notes
+from tilestream.cli.printing import err, out, print_json, say, say_notes, show_worth
 from tilestream.cli.progress import progress
 from tilestream.cli.tables import report_table
 from tilestream.errors import LimitError, PartialError, StoreError, UsageError
@@ -219,10 +219,7 @@ def report_of(folder: Files) -> dict[str, Any]:
 def show_report(folder: Files) -> None:
     """Print what the estimates of a report are worth, its headline and where it is."""
     report = report_of(folder)
-    if report["worth"] is not None:
-        say("What these estimates are worth:")
-        for sentence in report["worth"]["told"]:
-            say(f"  {sentence}")
+    show_worth(report["worth"])
     out.print(report_table(report, cards(report)))
     say(f"The matcher is {report['facts']['matcher']['name']}")
     for line in [*not_estimated(report), *hardly_measured(report), *lost_labels(report)]:

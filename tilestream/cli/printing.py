@@ -2,7 +2,7 @@
 
 import json
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from rich.console import Console
@@ -55,6 +55,15 @@ errors = _Console(stderr=True)
 def say(line: str, to: Console = out) -> None:
     """One line as it is: nothing coloured, no path broken."""
     to.print(line, highlight=False, soft_wrap=True)
+
+
+def show_worth(worth: Mapping[str, Any] | None) -> None:
+    """Print what estimates are worth, as a report says it; None: it does not."""
+    if worth is None:
+        return
+    say("What these estimates are worth:")
+    for sentence in worth["told"]:
+        say(f"  {sentence}")
 
 
 def say_notes(notes: Notes, to: Console = err) -> None:

@@ -13,7 +13,7 @@ from tilestream.cli.fields import fields, flag, options_named, was_given, with_s
 from tilestream.cli.given_routes import routes_of
 from tilestream.cli.options import AsJson, DryRun, Routes, StoreUrl, numbers
 from tilestream.cli.plans import plan_table
-from tilestream.cli.printing import out, print_json, say, say_notes
+from tilestream.cli.printing import out, print_json, say, say_notes, show_worth
 from tilestream.cli.progress import progress
 from tilestream.cli.tables import (
     comparison_table,
@@ -361,6 +361,7 @@ def _show_comparison(content: dict[str, Any], store: str, folder: str, as_json: 
     if as_json:
         print_json(content)
     else:
+        show_worth(content["worth"])
         out.print(comparison_table(content))
         say(f"The page is at {Files.at(folder).under('compare.html').address}")
     if not any(choice["estimated"] for choice in content["choices"]):

@@ -51,6 +51,8 @@ class Comparison:
     """How it was made: settings by name."""
     notes: Notes = field(default_factory=dict)
     """What was noticed of the map and the routes, by source."""
+    worth: tuple[str, ...] = ()
+    """What its figures are worth, as sentences."""
 
     def __post_init__(self) -> None:
         wanted = {"rows": ROW_COLUMNS, "choices": CHOICE_COLUMNS, "cells": CELL_COLUMNS}
@@ -191,6 +193,7 @@ class Comparison:
                     "threshold": threshold,
                     "cap": cap,
                     "places": len(self.by_choice("vd_mean")),
+                    "worth": {"warnings": [], "told": self.worth},
                     "routes": list(dict.fromkeys(self.rows["route_id"])),
                     "choices": self.summaries(threshold),
                     "differing": self.differing(),
