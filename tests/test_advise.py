@@ -1,5 +1,6 @@
 """What would mend a poor stretch: the virtual drive with each remedy, and honest words."""
 
+import errno
 import json
 from collections.abc import Mapping
 from dataclasses import replace
@@ -18,6 +19,7 @@ from tilestream.apps.choices import Choice
 from tilestream.apps.remedies import FIRST_GUESS, remedies_of
 from tilestream.cli import run as command
 from tilestream.errors import UsageError
+from tilestream.files import Files
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.grid import TileGrid
 from tilestream.matcher import RegistrationSettings
@@ -188,3 +190,14 @@ def test_a_run_without_virtual_drives_is_refused(run: Path, tmp_path: Path) -> N
     (tmp_path / "tables").symlink_to(run / "tables")
     with pytest.raises(UsageError, match="virtual drives"):
         ts.advise(tmp_path)
+
+
+def test_where_a_run_cannot_be_written_the_option_for_another_place_is_named(
+    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(folder: Files) -> None:
+        raise OSError(errno.EROFS, "Read-only file system", folder.root)
+
+    monkeypatch.setattr(Files, "make", refuse)
+    assert command(["advise", str(run), "--threshold", "0.001"]) == 2
+    assert "--out names another place" in capsys.readouterr().err

@@ -11,8 +11,19 @@ import tilestream
 
 ROOT = Path(tilestream.__file__).parent
 FLOORS = (
-    ("errors", "version"),
-    ("bounded_yaml", "config", "crs", "files", "grid", "marks", "notebook", "notes", "user_cache"),
+    ("counts", "errors", "version"),
+    (
+        "bounded_yaml",
+        "config",
+        "crs",
+        "files",
+        "grid",
+        "marks",
+        "notebook",
+        "notes",
+        "patterns",
+        "user_cache",
+    ),
     ("kernels", "lock"),
     ("autoware_matcher", "sensor"),
     ("matcher", "records"),

@@ -30,7 +30,7 @@ from scenes import PLACES, in_map
 from scipy.spatial.transform import Rotation
 
 import tilestream as ts
-from tilestream.cli import run
+from tilestream.cli import fields, run
 from tilestream.cli.app import COMMANDS, command_of
 from tilestream.cli.printing import err
 from tilestream.cli.progress import progress
@@ -116,6 +116,27 @@ def test_help_names_every_command(capsys: Told) -> None:
 def test_the_list_of_commands_says_what_each_says_of_itself() -> None:
     for name, (_, told) in COMMANDS.items():
         assert command_of(name).help.split("\n\n")[0] == told
+
+
+def test_options_are_grouped_with_the_usual_ones_first(capsys: Told) -> None:
+    assert run(["estimate", "--help"]) == 0
+    shown = capsys.readouterr().out
+    first = shown[: shown.index(fields.PLACES)]
+    assert all(f"{name} " in first for name in ("--route", "--sensor", "--matcher", "--out"))
+    at = [
+        shown.index(heading)
+        for heading in (
+            fields.PLACES,
+            fields.MAP,
+            fields.LOGS,
+            fields.REPORT,
+            fields.GATE,
+            fields.TASKS,
+        )
+    ]
+    assert at == sorted(at)
+    options = {p.name for name in COMMANDS for p in command_of(name).params}
+    assert set(fields.PANELS) <= options, "no heading for what no command has"
 
 
 def test_the_list_of_commands_comes_without_what_they_need() -> None:
@@ -530,7 +551,7 @@ def test_a_bad_source_among_good_ones_is_listed_and_the_rest_is_done(
     assert run(["ingest", *sources, "--store", url]) == 1
     told = capsys.readouterr()
     assert "Traceback" not in told.err
-    assert f"error: {url}: 2 sources or tiles failed, the rest is done:" in told.err
+    assert f"error: {url}: 2 failed, the rest is done:" in told.err
     assert f"  {short}: {short}" in told.err
     assert f"  {wrong}: {wrong}" in told.err
     assert f"{pcd}: pcd binary, {len(cloud):,} points" in told.out

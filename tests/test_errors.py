@@ -48,7 +48,7 @@ def test_what_was_not_run_is_told_apart_by_what_it_needs() -> None:
         "3 of merge: no space (0_0, 1_0, 2_0)",
         "3 of cells: not run, since what they need failed: no space (0_0, 1_0, 2_0)",
     ]
-    assert counted(failures, "tasks") == "3 tasks failed, 3 were not run"
+    assert counted(failures) == "3 failed, 3 not run"
     assert counted({"a": "x"}) == "1 failed"
     (single,) = alike({"cells-0_0": f"{NOT_RUN}merge-0_0 failed: no space"})
     assert single == "cells-0_0: not run, since merge-0_0 failed: no space"

@@ -2,6 +2,7 @@
 for.
 """
 
+import errno
 import itertools
 import json
 import math
@@ -20,12 +21,14 @@ from pyproj import CRS, Transformer
 from test_matcher_file import NESTED
 
 import tilestream as ts
+from tilestream.apps.export.covariance_files import Format
 from tilestream.apps.export.poor_stretches import BESIDE, area, areas, poor_stretches
 from tilestream.autoware_matcher import MATCHER, read_matcher
 from tilestream.cli import run as command
 from tilestream.errors import SourceNotFoundError, UsageError
 from tilestream.factors import observability
 from tilestream.factors.rows import PLACE_COLUMNS, STATUS_COLUMNS
+from tilestream.files import Files
 from tilestream.model.correlation import POOLED
 from tilestream.model.covariance import COVARIANCE_COLUMNS, as_it_is, calibration_told
 from tilestream.model.training import PREDICTION_COLUMNS
@@ -375,7 +378,39 @@ def test_poor_is_what_errs_or_is_lost() -> None:
     assert poor_stretches(said, 1.0, 0.5) == []
 
 
+@pytest.mark.parametrize("kind", ["autoware", "csv", "json"])
+def test_only_an_earlier_export_is_written_over(kind: Format, run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "a.txt"
+    for _ in range(2):
+        exported(run, out, format=kind)
+    others = {"autoware", "csv", "json"} - {kind}
+    made = out.read_bytes()
+    for other in others:
+        with pytest.raises(UsageError, match="is no export of this format"):
+            exported(run, out, format=other)
+    out.write_text("mine\n")
+    with pytest.raises(UsageError, match="is no export of this format"):
+        exported(run, out, format=kind)
+    assert out.read_text() == "mine\n"
+    out.write_bytes(b"")  # as `mktemp` makes one
+    exported(run, out, format=kind)
+    assert out.read_bytes() == made
+
+
 # --- The command
+
+
+def test_where_a_run_cannot_be_written_the_option_for_another_place_is_named(
+    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(folder: Files) -> None:
+        raise OSError(errno.EROFS, "Read-only file system", folder.root)
+
+    monkeypatch.setattr(Files, "make", refuse)
+    assert command(["export", "covariance", str(run)]) == 2
+    assert "--out names another place" in capsys.readouterr().err
+    assert command(["export", "covariance", str(run), "--out", str(run / "x" / "a.csv")]) == 1
+    assert "--out" not in capsys.readouterr().err
 
 
 def test_the_command_says_and_writes_the_same(

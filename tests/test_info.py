@@ -1,6 +1,10 @@
 """What `info` says of everything that is read or made, on real files, with right values."""
 
 import json
+import os
+import shutil
+import socket
+import time
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +24,8 @@ from tilestream.cli import run
 from tilestream.errors import CrsError, SourceNotFoundError, UnknownFormatError
 from tilestream.formats.logs import open_log
 from tilestream.formats.routes.lanelet2 import NOT_FOR_VEHICLES
+from tilestream.lock import only_writer
+from tilestream.marks import sealed, unsealed
 from tilestream.model.dataset import made_with
 from tilestream.model.file import save_model
 from tilestream.model.training import train
@@ -149,7 +155,7 @@ def test_what_is_nothing_of_ours(tmp_path: Path) -> None:
     (tmp_path / "a.doc").write_text("hello")
     with pytest.raises(UnknownFormatError, match="models"):
         info(tmp_path / "a.doc")
-    assert len({kind.name for kind in KINDS}) == len(KINDS) == 6
+    assert len({kind.name for kind in KINDS}) == len(KINDS) == 8
 
 
 # --- What we have made
@@ -200,9 +206,66 @@ def test_a_run_directory(job: RunSettings, capsys: Told) -> None:
     text = record.read_text()
     record.write_text(text.replace('"done"', '"none"'))
     try:
-        assert told(job.out, capsys)["state"].startswith("damaged: its run.json")
+        assert run(["info", job.out]) == 1
+        assert "run.json is damaged" in capsys.readouterr().err
     finally:
         record.write_text(text)
+
+
+def test_a_run_whose_process_is_gone_says_so(
+    job: RunSettings, tmp_path: Path, capsys: Told
+) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(job.out, copy)
+    record = unsealed(json.loads((copy / "run.json").read_text()))
+    (copy / "run.json").write_text(json.dumps(sealed(record | {"state": "running"})))
+    with only_writer(copy):
+        assert f"process {os.getpid()}" in told(copy, capsys)["state"]
+    for lock in (None, {"host": socket.gethostname(), "process": 2**22 + 1}):
+        if lock is not None:  # as SIGKILL leaves it
+            now = time.time()
+            left = {"since": now, "renewed": now, "token": "a", **lock}
+            (copy / ".lock").write_text(json.dumps(left))
+        assert "stopped before its end" in told(copy, capsys)["state"]
+    assert run(["status", str(copy)]) == 1
+    assert "stopped before its end" in capsys.readouterr().err
+    assert run(["status", job.out, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["run"], found["whole"]) == ("whole", True)
+
+
+def test_a_comparison_and_what_is_made_on_the_map_of_a_run(
+    job: RunSettings, tmp_path: Path, capsys: Told
+) -> None:
+    out, route = tmp_path / "out", ["--route", job.routes[0], "--spacing", "15"]
+    assert run(["compare", job.out, *route, "--range-max", "20,30", "--out", str(out)]) == 0
+    capsys.readouterr()
+    found = told(out, capsys)
+    assert found["kind"] == "comparison"
+    assert found["coverage"] == {"places": 3, "routes": 1, "choices": 2}
+    assert sum(line.startswith("choice VLP16-") for line in found["contents"]) == 2
+    (out / "compare.json").write_text("{")
+    assert run(["info", str(out)]) == 1
+
+
+def test_a_picture_for_foxglove_is_no_log(job: RunSettings, tmp_path: Path, capsys: Told) -> None:
+    path = Path(job.out) / "report" / "foxglove.mcap"
+    found = told(path, capsys)
+    assert found["kind"] == "scene"
+    assert any(line.startswith("/tilestream/places: ") for line in found["contents"])
+    (tmp_path / "cut.mcap").write_bytes(path.read_bytes()[:2000])
+    assert run(["info", str(tmp_path / "cut.mcap")]) == 1
+
+
+def test_several_are_told_one_after_the_other(job: RunSettings, cases: Path, capsys: Told) -> None:
+    street = str(cases / "street.pcd")
+    assert run(["info", street, job.store_url, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [one["kind"] for one in found] == ["points", "map"]
+    assert run(["info", "gone.pcd", street]) == 1
+    said = capsys.readouterr()
+    assert street in said.out.replace("\n", "")
+    assert said.err.count("gone.pcd") == 1
 
 
 def test_the_tables_of_a_command_alone(job: RunSettings, tmp_path: Path, capsys: Told) -> None:

@@ -312,7 +312,7 @@ def test_the_good_sources_are_ingested_and_the_bad_one_leaves_nothing(tmp_path: 
     whole = bad.read_bytes()
     bad.write_bytes(whole[:-100])
     url = tmp_path / "map.zarr"
-    with pytest.raises(PartialError, match=r"1 sources or tiles failed.*\n.*bad\.pcd") as caught:
+    with pytest.raises(PartialError, match=r"1 failed, the rest.*\n.*bad\.pcd") as caught:
         ts.ingest([good, bad], url, tile_size=10.0)
     assert list(caught.value.failures) == [str(bad)]
     alone = ts.ingest(good, tmp_path / "alone.zarr", tile_size=10.0)

@@ -27,6 +27,14 @@ assert finite_points(one, one, one, one, one, out) == 3 and (out == 2.0).all()
 print(finite_points.stats.cache_path, sum(finite_points.stats.cache_hits.values()))
 """
 
+TOLD = f"""
+import logging, sys
+logging.basicConfig(level="INFO", format="%(message)s", stream=sys.stdout)
+from tilestream.kernels.cache import are_kept
+print("kept" if are_kept() else "not kept")
+{SUMS}
+"""
+
 IN_WORKERS = """
 import multiprocessing
 from tilestream.kernels import rows
@@ -114,6 +122,18 @@ def installation(tmp_path: Path) -> Iterator[Installation]:
 def test_a_second_start_reads_what_the_first_compiled(installation: Installation) -> None:
     for hits in ("0", "1"):
         assert installation.start() == ([str(installation.pycache), hits], [])
+
+
+@posix
+def test_compiling_is_told_once_and_only_where_something_is_compiled(
+    installation: Installation,
+) -> None:
+    first, _ = installation.start(TOLD)
+    assert " ".join(first).count("compiling kernels") == 1
+    assert first[:2] == ["not", "kept"]
+    again, _ = installation.start(TOLD)
+    assert "compiling" not in again
+    assert again[0] == "kept"
 
 
 @posix

@@ -696,7 +696,10 @@ def test_a_run_directory_that_is_a_file_is_named(inputs: Path, tmp_path: Path) -
         ({"drives": [{"log": "nowhere.mcap"}]}, r"nowhere\.mcap: no such (log|file)"),
         ({"routes": ["nowhere.geojson"]}, r"nowhere\.geojson: no such file; check the path"),
         ({"map": {"sources": ["nowhere.laz"]}}, r"nowhere\.laz: no such file .*check the path"),
-        ({"map": {"sources": ["nowhere_*.laz"]}}, r"nowhere_\*\.laz: the pattern matches no file"),
+        (
+            {"map": {"sources": ["nowhere_*.laz"]}},
+            r"nowhere_\*\.laz: no such file or directory, and as a pattern it matches no file",
+        ),
         (
             {"model": {"use": "nowhere.skops"}},
             r"nowhere\.skops: no such model file; see model\.use",
@@ -880,7 +883,7 @@ def test_the_command_prints_the_headline_and_gates(
     assert command(["run", str(config), "--workers", "1", "--fail-over", "1e-6"]) == 1
     assert "mean: 78 of 78 sample points are above 1e-06 m" in capsys.readouterr().err
     assert command(["run", str(config), "--workers", "1", "--fail-over", "99"]) == 0
-    assert "0 of 78 sample points have no estimate" in capsys.readouterr().err
+    assert "0 of 78 sample points without an estimate" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("limit", ["0", "-0.25", "nan"])
@@ -903,11 +906,11 @@ def test_a_gate_does_not_open_on_places_that_nobody_estimated(
     places["status"] = "done"
     places.to_parquet(tmp_path / "report" / "places.parquet")
     (tmp_path / "report" / "report.json").write_text(json.dumps({"drives": []}))
-    with pytest.raises(LimitError, match="10 of 100 sample points have no estimate"):
+    with pytest.raises(LimitError, match="10 of 100 sample points without an estimate"):
         require_within(Files.at(tmp_path), 0.25)
     places.iloc[:92].to_parquet(tmp_path / "report" / "places.parquet")
     require_within(Files.at(tmp_path), 0.25)
-    assert "2 of 92 sample points have no estimate" in capsys.readouterr().err
+    assert "2 of 92 sample points without an estimate" in capsys.readouterr().err
 
 
 def test_labels_that_are_lost_are_told_with_their_reasons() -> None:
@@ -917,7 +920,7 @@ def test_labels_that_are_lost_are_told_with_their_reasons() -> None:
     ]
     report = {"headline": {"labelled": 60}, "lost_labels": lost}
     assert lost_labels(report) == [
-        "21 of 81 measured places are not used:",
+        "21 of 81 measured places not used:",
         "  20 no sample point near: 8 m away",
         "  1 label failed",
     ]

@@ -210,7 +210,7 @@ def test_a_run_directory_on_s3(
     other = settings.model_dump(mode="json") | {"spacing": 2.0}  # so that workers have work
     (here / "job.yaml").write_text(json.dumps(other))
     assert command(gate) == 1
-    assert "sample points have no estimate" in capsys.readouterr().err
+    assert "sample points without an estimate" in capsys.readouterr().err
     assert Files.at(f"{settings.out}/dask-performance.html").there()
     assert names_in(here) == sorted([*before, "job.yaml"])
 

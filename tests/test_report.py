@@ -382,7 +382,7 @@ def test_a_gate_closes_where_too_little_is_known() -> None:
     assert few["estimate"].isna().sum() == 10
     assert gate(places, 0.25) == []
     (many,) = gate(few, 0.25)
-    assert "10 of 100 sample points have no estimate, more than 5%" in many
+    assert "10 of 100 sample points without an estimate, more than 5%" in many
     allowed = places.assign(estimate=places["estimate"].where(places.index > 4))
     assert allowed["estimate"].isna().sum() == 5
     assert gate(allowed, 0.25) == []

@@ -325,6 +325,7 @@ def test_verify_lists_what_is_damaged_and_repair_lets_the_same_command_make_it_a
     told = capsys.readouterr().err
     assert f"{first}/points" in told
     assert f"{second}/points" in told
+    assert [line.count(store.url) for line in told.splitlines()[1:]] == [1, 1]
     assert run(["verify", store.url, "--repair"]) == 0
     assert set(store.condition().lost) == {first, second}
     ts.ingest(cloud, store.url, tile_size=10.0)

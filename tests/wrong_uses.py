@@ -43,7 +43,8 @@ FILES = {
 
 
 def write_world(folder: Path) -> None:
-    """All files; `map.zarr`, `other.zarr` (of another version), `run` (an estimate), `empty`."""
+    """All files; `map.zarr`, `other.zarr` (of another version), `run` (an estimate), `damaged` (the
+    same without a record), `empty`."""
     for name, text in FILES.items():
         (folder / name).write_text(text)
     street = in_map(PLACES["canyon"](np.random.default_rng(1), 20.0, 0.3))
@@ -59,6 +60,8 @@ def write_world(folder: Path) -> None:
     group.attrs["tilestream"] = ours | {"schema": ours["schema"] + 1}
     how = {"model": "physics", "spacing": 6.0}
     ts.estimate(folder / "map.zarr", folder / "route.csv", out=folder / "run", **how)
+    shutil.copytree(folder / "run", folder / "damaged")
+    (folder / "damaged" / "run.json").write_text("")
 
 
 def _write_drive(path: Path, street: np.ndarray) -> None:

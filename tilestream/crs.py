@@ -131,8 +131,10 @@ def one_crs(asked: str | None, sources: Iterable[tuple[str, str | None]]) -> str
         bare = [path for path, crs in named if crs is None]
         if not entered.metric and bare:
             raise CrsError(
-                f"{ASKED}, {_short(asked)}, is in {entered.xy.name} and {bare[0]} names none: "
-                "bring its points to metres first, or write its CRS into the file"
+                f"{ASKED}, {_short(asked)}, is in {entered.xy.name} and {bare[0]} names none, so "
+                f"its points would be read as metres: write the CRS into the file (of LAS and LAZ "
+                f"`pdal translate IN OUT --writers.las.a_srs={_short(asked)}`), or multiply its "
+                f"coordinates by {entered.xy.metres:.12g}"
             )
         named.insert(0, (ASKED, entered.crs))
     known = [(who, crs) for who, crs in named if crs is not None]

@@ -158,11 +158,11 @@ def alike(failures: Mapping[str, str]) -> list[str]:
     ]
 
 
-def counted(failures: Mapping[str, str], what: str = "") -> str:
-    """How many failed, and how many were not run because of that: `3 tasks failed`."""
+def counted(failures: Mapping[str, str]) -> str:
+    """How many failed, and how many were not run because of that: `3 failed, 2 not run`."""
     not_run = sum(reason.startswith(NOT_RUN) for reason in failures.values())
-    told = f"{len(failures) - not_run:,} {what} failed".replace("  ", " ")
-    return told + (f", {not_run:,} were not run" if not_run else "")
+    told = f"{len(failures) - not_run:,} failed"
+    return told + (f", {not_run:,} not run" if not_run else "")
 
 
 def _together(names: list[str], reason: str) -> str:

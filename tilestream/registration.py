@@ -4,8 +4,6 @@ A scan is preprocessed, the cells around it become a local map, and from every s
 are taken until one is short.
 """
 
-import logging
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -23,7 +21,6 @@ LARGEST_SCAN = 10_000.0
 """Largest distance of a scan point from the lidar [m]; a farther one is in another frame."""
 RIGID = 1e-4
 """How far R^T R of a start may be from the identity: poses are often written with 6 digits."""
-_log = logging.getLogger(__name__)
 
 
 def register(
@@ -70,8 +67,6 @@ def register(
     seven = None if settings.neighbours == "direct1" else True
     limit = np.float32(local.reach**2) if local.reach else None
     slots = empty_slots(len(points), 7 if seven else 1, around.longest)
-    if not getattr(align, "signatures", True):  # there are none under NUMBA_DISABLE_JIT
-        _log.info("loading the registration kernels; the first time, compiling them for a minute")
     in_lidar, buckets = np.ascontiguousarray(points.T), corner - around.origin
     align(in_lidar, buckets, local, rule, seven, limit, slots, out)
     if not out.hits.all():

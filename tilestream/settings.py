@@ -61,9 +61,9 @@ def bytes_of(amount: object) -> object:
 
 Bytes = Annotated[int, BeforeValidator(bytes_of), Field(gt=0)]
 """An amount of memory, as a number or as `1.5GB`."""
-DEFAULT_MEMORY = 2_000_000_000
-"""What a task may use where the user promises nothing else [bytes]; a tile of a dense city at 0.2 m
-with those around it needs 1.6 GB."""
+MEMORY = "2GB"
+"""What a task may use where the user promises nothing else: a tile of a dense city at 0.2 m with
+those around it needs 1.6 GB."""
 
 
 def _six_numbers(given: object) -> object:
@@ -366,7 +366,7 @@ class PlaceSettings(Settings):
     prediction_error: Annotated[float, Field(gt=0.0, le=2.0)] = PREDICTION_ERROR
     """How far off the vehicle's filter predicts its pose, from which a registration then starts:
     standard deviation in map x and in y [m]. Covariances are of such registrations."""
-    memory: Bytes = DEFAULT_MEMORY
+    memory: Bytes = Field(default=MEMORY, validate_default=True)
     """What one task may use [bytes], also as 512MB or 2GB."""
 
     def cells_for(self, matcher: RegistrationSettings) -> float:
@@ -389,3 +389,7 @@ class PlaceSettings(Settings):
     def looking_sensor(self) -> Sensor:
         """The sensor as which the paper's factors look: the first."""
         return self.vehicle.sensors[0]
+
+
+DEFAULT_MEMORY = PlaceSettings().memory
+"""`MEMORY` in bytes."""

@@ -11,7 +11,7 @@ import pandas as pd
 
 from tilestream.apps.choices import choice_tasks, tables_by_choice
 from tilestream.apps.remedies import FIRST_GUESS, remedies_of
-from tilestream.apps.runs import places_of, settings_of, worth_of
+from tilestream.apps.runs import NEEDED, places_of, settings_of, worth_of
 from tilestream.errors import PartialError, SourceNotFoundError, UsageError, counted
 from tilestream.factors.rows import samples_of_places
 from tilestream.files import Files
@@ -127,7 +127,7 @@ def advise(
         plan = Plan.of((*map_plan.tasks.values(), *tasks), settings.memory)
         failures = make_tables(plan, folder, client, watch)
         if failures:
-            told = f"{folder}: {counted(failures, 'tasks')}, the rest is done:"
+            told = f"{folder}: {counted(failures)}, the rest is done:"
             raise PartialError(told, failures)
         tables = tables_by_choice(plan.outputs(observe.name))
         seen |= {name: read_tables(tables[choice.name]) for name, choice in tried.items()}
@@ -141,9 +141,9 @@ def _known(place: str | os.PathLike[str]) -> pd.DataFrame:
     """
     places, drives = places_of(place), rows_of(place, "observability")
     if places.empty:
-        raise SourceNotFoundError(f"{place}: no tables of a run; `ts.run` writes some")
+        raise SourceNotFoundError(f"{place}: no tables of a run{NEEDED}")
     if "estimate" not in places or drives is None:
-        raise UsageError(f"{place}: has no estimates by virtual drives: `tilestream estimate`")
+        raise UsageError(f"{place}: has no estimates by virtual drives{NEEDED}")
     shown = ["arc_length", "heading", "x", "y", "z", "estimate", "floor"]
     places = places[[*PLACE, *shown]].merge(drives[[*PLACE, *OF_DRIVE]], on=PLACE, how="left")
     return places.sort_values(PLACE, kind="stable", ignore_index=True)

@@ -104,7 +104,7 @@ def compare(
     tables = tables_by_choice(plan.outputs(observe.name))
     failures = make_tables(plan, out, client, watch)
     if failures:
-        raise PartialError(f"{out}: {counted(failures, 'tasks')}, the rest is done:", failures)
+        raise PartialError(f"{out}: {counted(failures)}, the rest is done:", failures)
     order = [route.route_id for route in routes]
     rows = pd.concat(
         [rows_of(choice, tables[choice.name], order, store) for choice in choices],

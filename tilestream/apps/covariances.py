@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 import pandas as pd
 
-from tilestream.apps.runs import PLACE, places_of
+from tilestream.apps.runs import NEEDED, PLACE, places_of
 from tilestream.errors import SourceNotFoundError, UsageError
 from tilestream.files import Files
 from tilestream.model.correlation import Correlation, correlations
@@ -98,9 +98,9 @@ def covariances(place: str | os.PathLike[str]) -> Covariances:
     """
     places = places_of(place)
     if places.empty:
-        raise SourceNotFoundError(f"{place}: no tables of a run; `ts.run` writes some")
+        raise SourceNotFoundError(f"{place}: no tables of a run{NEEDED}")
     if "estimate" not in places:
-        raise UsageError(f"{place}: has no estimates: give a run of `run` or `estimate`")
+        raise UsageError(f"{place}: has no estimates{NEEDED}")
     error = job_of(Files.at(place)).get("prediction_error")
     if error is None or "cov_along_along" not in places:
         raise UsageError(

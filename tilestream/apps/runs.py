@@ -20,6 +20,7 @@ import pandas as pd
 from scipy.spatial import cKDTree
 
 from tilestream.bounded_yaml import parse_yaml
+from tilestream.counts import count_of
 from tilestream.errors import (
     SourceNotFoundError,
     StoreNotFoundError,
@@ -32,11 +33,11 @@ from tilestream.model.covariance import COVARIANCE_COLUMNS
 from tilestream.model.join import ON_PATH
 from tilestream.model.training import ESTIMATES, MAIN, PREDICTION_COLUMNS
 from tilestream.notebook import axes_of, html_of
-from tilestream.pipeline.jobs.run_book import ENDED, content_as_written, told_before
+from tilestream.pipeline.jobs.run_book import ENDED, content_as_written
 from tilestream.pipeline.jobs.run_folder import map_of, rows_of, table_paths
 from tilestream.pipeline.jobs.run_inputs import seen_otherwise
-from tilestream.pipeline.jobs.run_names import RECORD
 from tilestream.pipeline.jobs.run_settings import RunSettings
+from tilestream.pipeline.jobs.run_state import record_of
 from tilestream.records import Float64
 from tilestream.report.colours import FIXED, MISSING, scale_of
 from tilestream.report.formatting import CM_PER_M
@@ -54,6 +55,11 @@ MEASURED = {
     for target, name in ESTIMATES.items()
 }
 """Name of each label beside the estimate of the same."""
+NEEDED = (
+    ": give the run directory of `tilestream estimate` or `tilestream run`; tables of `localize` "
+    "or `factors` alone have no estimates"
+)
+"""What has no estimates is told with this."""
 OF_LABEL = ["drive", *MEASURED.values(), "measured_distance"]
 
 
@@ -119,7 +125,7 @@ def worth_of(place: str | os.PathLike[str]) -> list[str]:
         DamagedError: the report is not what was written.
     """
     folder = Files.at(place)
-    report, record = folder.under(REPORT), told_before(folder.under(RECORD))
+    report, record = folder.under(REPORT), record_of(folder)
     if not report.there() or record.get("state") not in ENDED:
         return []
     worth = json.loads(content_as_written(report, record, REPORT))["worth"]
@@ -131,10 +137,10 @@ def places_of(place: str | os.PathLike[str]) -> pd.DataFrame:
     as its tables go, each virtual drive of its own place alone.
 
     Raises:
-        DamagedError: a table, or what the report has, is not what was written.
+        DamagedError: the record, a table, or what the report has, is not what was written.
     """
     folder = Files.at(place)
-    report, record = folder.under(PLACES), told_before(folder.under(RECORD))
+    report, record = folder.under(PLACES), record_of(folder)
     if report.there() and record.get("state") in ENDED:
         shown = pd.read_parquet(io.BytesIO(content_as_written(report, record, PLACES)))
         return shown.drop(columns=["geometry", *OF_LABEL], errors="ignore")
@@ -160,7 +166,7 @@ def _labels(place: str | os.PathLike[str]) -> pd.DataFrame:
     """The measured places, with the drive of each; of a job none that was seen with another lidar
     than that of its estimates, or that does not fit the map.
     """
-    unfit = told_before(Files.at(place).under(RECORD)).get("unfit", {})
+    unfit = record_of(Files.at(place)).get("unfit", {})
     tables, others = [], {*_otherwise(place), *unfit}
     for path in table_paths(place, "errors"):
         group = path.rsplit("/", 2)[1]
@@ -294,7 +300,7 @@ class Run:
             if name in table:
                 known = table[name].dropna()
                 spans = f", {known.min():.3f} to {known.max():.3f} m" if len(known) else ""
-                facts[told] = f"{len(known):,} places{spans}"
+                facts[told] = f"{count_of(len(known), 'place')}{spans}"
         if self.report:
             facts["report"] = f"{self.place}/report/index.html"
         return html_of(f"Run {self.place}", facts)

@@ -27,7 +27,7 @@ class Damage:
     path: str
     """The file, table or tile."""
     reason: str
-    """What is wrong."""
+    """What is wrong, without the path."""
     sources: tuple[str, ...] = ()
     """What it is made from, as far as that is known."""
     remove: Callable[[], None] | None = None
@@ -105,7 +105,7 @@ def _wrong(path: str, read: Callable[[], object], *made_of: Any) -> Damage | Non
     try:
         read()
     except (TilestreamError, OSError) as error:
-        return Damage(path, str(error), *made_of)
+        return Damage(path, str(error).removeprefix(path).lstrip("/: "), *made_of)
     return None
 
 

@@ -10,7 +10,7 @@ from tilestream.apps import advise as advising
 from tilestream.apps.runs import settings_of
 from tilestream.cli.cluster import HERE, Cluster, on_cluster
 from tilestream.cli.fields import fields, with_settings
-from tilestream.cli.options import AsJson
+from tilestream.cli.options import AsJson, or_elsewhere
 from tilestream.cli.printing import out, print_json, say, show_worth
 from tilestream.cli.progress import progress
 from tilestream.report.formatting import cm, cm_about, distance
@@ -40,7 +40,11 @@ def advise(
     """
     settings = settings_of(run)
     memory = DEFAULT_MEMORY if settings is None else settings.memory
-    with cluster.client(memory) as client, progress() as watch:
+    with (
+        or_elsewhere(f"{run}/advise", folder),
+        cluster.client(memory) as client,
+        progress() as watch,
+    ):
         found = advising.advise(run, folder, threshold=report.threshold, client=client, watch=watch)
     if as_json:
         print_json(content_of(found))

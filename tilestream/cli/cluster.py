@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
+from tilestream.cli.fields import TASKS
 from tilestream.cli.printing import err, say
 from tilestream.errors import UsageError
 from tilestream.pipeline.engine.cluster import LOOPBACK, TlsFiles, late_client
@@ -17,8 +18,11 @@ from tilestream.pipeline.engine.events import page_url, serve_page
 from tilestream.pipeline.engine.late_client import around
 
 WORKERS = "Worker processes on this machine; 1: this process does all."
-AllCores = Annotated[int | None, typer.Option(min=1, help=WORKERS, show_default="one per core")]
-Few = Annotated[int | None, typer.Option(min=1, help=WORKERS)]
+AllCores = Annotated[
+    int | None,
+    typer.Option(min=1, help=WORKERS, show_default="one per core", rich_help_panel=TASKS),
+]
+Few = Annotated[int | None, typer.Option(min=1, help=WORKERS, rich_help_panel=TASKS)]
 
 
 @dataclass(frozen=True)
@@ -60,22 +64,41 @@ HERE, ALL_CORES = Cluster(workers=1), Cluster()
 
 def cluster_of(
     scheduler: Annotated[
-        str | None, typer.Option(help="Run on this Dask scheduler, e.g. tcp://10.0.0.1:8786.")
+        str | None,
+        typer.Option(
+            help="Run on this Dask scheduler, e.g. tcp://10.0.0.1:8786.", rich_help_panel=TASKS
+        ),
     ] = None,
     workers: AllCores = None,
     host: Annotated[
-        str, typer.Option(help="Where a scheduler of our own listens, with its dashboard.")
+        str,
+        typer.Option(
+            help="Where a scheduler of our own listens, with its dashboard.", rich_help_panel=TASKS
+        ),
     ] = LOOPBACK,
     tls_ca: Annotated[
         Path | None,
-        typer.Option(exists=True, dir_okay=False, help="Certificate of the authority (PEM)."),
+        typer.Option(
+            exists=True,
+            dir_okay=False,
+            help="Certificate of the authority (PEM).",
+            rich_help_panel=TASKS,
+        ),
     ] = None,
     tls_cert: Annotated[
         Path | None,
-        typer.Option(exists=True, dir_okay=False, help="The cluster's own certificate (PEM)."),
+        typer.Option(
+            exists=True,
+            dir_okay=False,
+            help="The cluster's own certificate (PEM).",
+            rich_help_panel=TASKS,
+        ),
     ] = None,
     tls_key: Annotated[
-        Path | None, typer.Option(exists=True, dir_okay=False, help="Its private key (PEM).")
+        Path | None,
+        typer.Option(
+            exists=True, dir_okay=False, help="Its private key (PEM).", rich_help_panel=TASKS
+        ),
     ] = None,
 ) -> Cluster:
     """The cluster that these options describe.

@@ -13,15 +13,20 @@ from tilestream.apps.info.record import Info
 from tilestream.cli.fields import fields, with_settings
 from tilestream.cli.options import AsJson
 from tilestream.cli.printing import out, print_json
+from tilestream.counts import count_of
 from tilestream.crs import named
+from tilestream.errors import PartialError, TilestreamError, UsageError
 from tilestream.settings import LogOptions
 
 
 @with_settings
 def info(
-    file: Annotated[
-        str,
-        typer.Argument(help="Points, a log, routes, a map folder, a store, a run, or a model."),
+    files: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="FILE",
+            help="Points, logs, routes, map folders, stores, runs, tables, comparisons, models.",
+        ),
     ],
     log: Annotated[LogOptions, fields(*LogOptions.model_fields)],
     starts_of: Annotated[
@@ -36,13 +41,25 @@ def info(
 ) -> None:
     """Show what is in anything that is read or made: extent, CRS, coverage, state, notes."""
     if starts_of is not None:
-        import_module("tilestream.cli.ends").show_ends(file, starts_of, of_drive, as_json)
+        if len(files) > 1:
+            raise UsageError("--starts-of is of one run: name one")
+        import_module("tilestream.cli.ends").show_ends(files[0], starts_of, of_drive, as_json)
         return
-    found = describing.info(file, log)
+    found, failures = [], {}
+    for file in files:
+        try:
+            found.append(describing.info(file, log))
+        except TilestreamError as error:
+            if len(files) == 1:
+                raise
+            failures[file] = str(error).removeprefix(f"{file}: ")
     if as_json:
-        print_json(found.plain())
+        print_json(found[0].plain() if len(files) == 1 else [one.plain() for one in found])
     else:
-        out.print(info_table(found))
+        for one in found:
+            out.print(info_table(one))
+    if failures:
+        raise PartialError(f"{len(failures):,} of {len(files):,} cannot be described:", failures)
 
 
 def info_table(found: Info) -> Table:
@@ -51,11 +68,13 @@ def info_table(found: Info) -> Table:
     table.add_row("what", f"{found.kind}: {found.format}")
     table.add_row("state", found.state)
     if found.size_bytes is not None:
-        table.add_row("size", f"{found.size_bytes:,} bytes")
+        table.add_row("size", count_of(found.size_bytes, "byte"))
     if found.fields:
         table.add_row("fields", ", ".join(f"{name}: {kind}" for name, kind in found.fields))
-    if found.kind != "model":
-        table.add_row("CRS", "none is named" if found.crs is None else named(found.crs))
+    if found.kind not in ("model", "comparison", "scene"):
+        taken = ": taken as metres" if found.kind in ("points", "map") else ""
+        unnamed = f"none is named{taken}"
+        table.add_row("CRS", unnamed if found.crs is None else named(found.crs))
     for name, frame in found.frames.items():
         table.add_row(f"frame of {name}", frame or "not named")
     for name, told in (*_extent(found), *_coverage(found)):

@@ -5,6 +5,7 @@ from rich.box import SIMPLE
 from rich.table import Table
 
 from tilestream.cli.printing import out, print_json
+from tilestream.counts import count_of
 from tilestream.label import FAILED
 from tilestream.pipeline.jobs.starts_of import starts_of
 
@@ -24,7 +25,9 @@ def show_ends(place: str, sample: int, of_drive: str, as_json: bool) -> None:
 def ends_table(rows: pd.DataFrame) -> Table:
     """Where the starts of a place began and ended, a line per start."""
     failed = int((rows["error"] > FAILED).sum())
-    title = f"{len(rows)} starts of sample point {rows['sample'].iloc[0]}, {failed} failed"
+    title = (
+        f"{count_of(len(rows), 'start')} of sample point {rows['sample'].iloc[0]}, {failed} failed"
+    )
     table = Table(title=title, title_justify="left", box=SIMPLE)
     for name in ("scan", "start", *(f"{name} [m]" for name in ENDS), "converged"):
         table.add_column(name, justify="right")

@@ -9,7 +9,7 @@ from rich.table import Table
 from tilestream.apps.export import covariance as exported
 from tilestream.apps.export.covariance_files import Format
 from tilestream.cli.fields import fields, with_settings
-from tilestream.cli.options import AsJson
+from tilestream.cli.options import AsJson, or_elsewhere
 from tilestream.cli.printing import out, print_json, say
 from tilestream.report.formatting import cm, distance, percent
 from tilestream.settings import ReportSettings
@@ -60,17 +60,18 @@ def export(
       and its `output_pose_covariance[36k..36k+35]` where that is nearer than `spacing`, else the
       constant `covariance.output_pose_covariance`
     """
-    told = exported.export(
-        what,
-        run,
-        file,
-        format=as_what,
-        every=updates,
-        inflate=inflate,
-        route=route,
-        threshold=report.threshold,
-        lost=lost,
-    )
+    with or_elsewhere(f"{run}/export", file):
+        told = exported.export(
+            what,
+            run,
+            file,
+            format=as_what,
+            every=updates,
+            inflate=inflate,
+            route=route,
+            threshold=report.threshold,
+            lost=lost,
+        )
     if as_json:
         print_json(told)
     else:

@@ -14,13 +14,28 @@ from pydantic.fields import FieldInfo
 
 from tilestream.config import Settings
 from tilestream.errors import SettingsError, UsageError
-from tilestream.settings import LogOptions
+from tilestream.settings import LogSettings
 
 OLD_FLAGS = {"range_max": "max-range", "blind_rear_deg": "blind-rear", "sweep_s": "sweep"}
 """Flags of version 0.1 that are still taken, by the setting that they are now called after."""
 
-LOGS = "How logs are read"
-"""Heading of the options that all commands have that read logs."""
+MAP, PLACES, STARTS = "The map", "Places and virtual drives", "Scans, starts and registrations"
+LOGS, REPORT, GATE, TASKS = "How logs are read", "The report", "A gate", "Where tasks run"
+PANELS = {
+    **dict.fromkeys(("crs", "partial", "keep_noise"), MAP),
+    **dict.fromkeys(("spacing", "cell_size", "route_z", "project_to", "prediction_error"), PLACES),
+    **dict.fromkeys(("range_max", "blind_rear_deg"), PLACES),
+    **dict.fromkeys(("true_pose", "scans_per_point", "allow_overlap", "scan_leaf"), STARTS),
+    **dict.fromkeys(("radius", "step", "beams", "deskew", "sweep_s"), STARTS),
+    **dict.fromkeys(LogSettings.model_fields, LOGS),
+    **dict.fromkeys(("threshold", "title", "own_range"), REPORT),
+    **dict.fromkeys(("fail_over", "fail_worse", "measure", "over"), GATE),
+    "memory": TASKS,
+}
+"""Headings of options in the help, by setting; the usual ones have none, and come first."""
+FEW = 7
+"""A command of so many settings needs no headings."""
+ORDER = (None, PLACES, MAP, STARTS, LOGS, REPORT, GATE, TASKS)
 
 
 WORD = re.compile(r"\w+")
@@ -61,13 +76,20 @@ def with_settings(command: Callable[..., None]) -> Callable[..., None]:
     hints = get_type_hints(command, include_extras=True)
     groups: dict[str, tuple[type[Settings], Fields]] = {}
     parameters: list[inspect.Parameter] = []
+    asked_for = [
+        part for hint in hints.values() for part in get_args(hint) if isinstance(part, Fields)
+    ]
+    many = sum(len(chosen.names) for chosen in asked_for) > FEW
     for parameter in inspect.signature(command).parameters.values():
         hint = hints[parameter.name]
         chosen = [part for part in get_args(hint) if isinstance(part, Fields)]
         if chosen:
             model = get_args(hint)[0]
             groups[parameter.name] = model, chosen[0]
-            parameters += [_option(model, name, chosen[0].own) for name in chosen[0].names]
+            parameters += [
+                _option(model, name, chosen[0].own, PANELS.get(name) if many else None)
+                for name in chosen[0].names
+            ]
         else:
             parameters.append(parameter.replace(annotation=hint))
 
@@ -87,6 +109,10 @@ def with_settings(command: Callable[..., None]) -> Callable[..., None]:
 
     first = [p for p in parameters if p.default is inspect.Parameter.empty]
     rest = [p for p in parameters if p.default is not inspect.Parameter.empty]
+    of_settings = {name for _, chosen in groups.values() for name in chosen.names}
+    rest.sort(  # a command's own come first, then settings by their headings
+        key=lambda p: ORDER.index(PANELS.get(p.name)) if p.name in of_settings else -1
+    )
     wrapped.__signature__ = inspect.Signature([*first, *rest])  # type: ignore[attr-defined]
     return wrapped
 
@@ -126,7 +152,9 @@ def was_given(context: typer.Context, name: str) -> bool:
     return source is None or source.name != "DEFAULT"
 
 
-def _option(model: type[Settings], name: str, own: dict[str, Any]) -> inspect.Parameter:
+def _option(
+    model: type[Settings], name: str, own: dict[str, Any], panel: str | None
+) -> inspect.Parameter:
     """The option of a field: `--its-name`, with its default and its docstring as help; what has no
     default is an argument.
     """
@@ -134,7 +162,6 @@ def _option(model: type[Settings], name: str, own: dict[str, Any]) -> inspect.Pa
     needed = known.is_required()
     old = OLD_FLAGS.get(name)
     flags = [flag(name), *([f"--{old}"] if old else [])]
-    panel = LOGS if name in LogOptions.model_fields else None
     how: Any = (
         typer.Argument(help=help_of(known))
         if needed

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from tilestream.cli.printing import say_notes
+from tilestream.counts import count_of
 from tilestream.errors import PartialError
 from tilestream.formats.routes import RoutesRead, read_all_routes, read_each
 from tilestream.notes import noticed
@@ -45,4 +46,4 @@ def routes_of(
     except PartialError as error:
         raise error.with_more(read.failures) from None
     if read.failures:
-        raise PartialError(f"{len(read.failures)} routes are left out:", read.failures)
+        raise PartialError(f"{count_of(len(read.failures), 'route')} left out:", read.failures)

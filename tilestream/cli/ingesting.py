@@ -11,6 +11,7 @@ from tilestream.cli.plans import plan_table
 from tilestream.cli.printing import out, print_json, say, say_notes
 from tilestream.cli.progress import progress
 from tilestream.cli.state import store_facts, tile_table
+from tilestream.counts import count_of
 from tilestream.errors import PartialError
 from tilestream.pipeline.jobs import ingest as ingest_map
 from tilestream.pipeline.jobs.map_expected import tiles_to_read
@@ -78,7 +79,7 @@ def ingest(
 def print_sources(store: TileStore) -> None:
     """What an ingest read, a line per source."""
     for source in store.sources():
-        say(f"{source['path']}: {source['format']}, {source['points']:,} points")
+        say(f"{source['path']}: {source['format']}, {count_of(source['points'], 'point')}")
         for line in source.get("contents", ()):  # older stores have none
             say(f"  {line}")
     say_notes(map_notes(store), to=out)

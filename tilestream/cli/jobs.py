@@ -17,6 +17,7 @@ from tilestream.cli.plans import forecast_table, plan_table
 from tilestream.cli.printing import err, out, print_json, say, say_notes, show_worth
 from tilestream.cli.progress import progress
 from tilestream.cli.tables import report_table
+from tilestream.counts import count_of
 from tilestream.errors import LimitError, PartialError, StoreError, UsageError
 from tilestream.files import Files
 from tilestream.pipeline.jobs import run as main_job
@@ -278,7 +279,7 @@ def lost_labels(report: dict[str, Any]) -> list[str]:
         + (f"; would be kept by {one['kept_by']}" if one.get("kept_by") else "")
         for one in lost
     ]
-    return [f"{total:,} of {of:,} measured places are not used:", *reasons]
+    return [f"{total:,} of {count_of(of, 'measured place')} not used:", *reasons]
 
 
 def require_within(
@@ -294,7 +295,7 @@ def require_within(
     missing = int(places["estimate"].isna().sum())
     between = int(interpolated(places).sum())
     told = f"; {between:,} are interpolated, not evaluated" if between else ""
-    say(f"{missing:,} of {len(places):,} sample points have no estimate{told}", to=err)
+    say(f"{missing:,} of {count_of(len(places), 'sample point')} without an estimate{told}", to=err)
     closed = gate(places, limit, report_of(folder)["drives"], measure, over)
     if closed:
         raise LimitError("; ".join(closed))

@@ -9,7 +9,7 @@ import typer
 from tilestream.apps import compare as comparing
 from tilestream.apps.choices import choices_of
 from tilestream.cli.cluster import HERE, Cluster, on_cluster
-from tilestream.cli.fields import fields, flag, options_named, was_given, with_settings
+from tilestream.cli.fields import STARTS, fields, flag, options_named, was_given, with_settings
 from tilestream.cli.given_routes import routes_of
 from tilestream.cli.options import AsJson, DryRun, Routes, StoreUrl, numbers
 from tilestream.cli.plans import plan_table
@@ -21,6 +21,7 @@ from tilestream.cli.tables import (
     error_table,
     factor_table,
 )
+from tilestream.counts import count_of
 from tilestream.errors import LimitError, PartialError
 from tilestream.factors.catalogue import Which
 from tilestream.factors.heights import notes_of_routes
@@ -30,6 +31,7 @@ from tilestream.notes import MATCHER, noticed
 from tilestream.pipeline.jobs import along_routes
 from tilestream.pipeline.jobs import localize as localize_drive
 from tilestream.pipeline.jobs.drive_measured import drive_measured
+from tilestream.pipeline.jobs.run_folder import map_of
 from tilestream.pipeline.jobs.run_inputs import reading_of
 from tilestream.pipeline.jobs.sources import map_notes, scans_of
 from tilestream.pipeline.jobs.unfit import unfit
@@ -52,7 +54,6 @@ from tilestream.settings import (
     StartSettings,
     VirtualSettings,
 )
-from tilestream.store import open_store
 
 Ranges = Annotated[
     list[str],
@@ -97,7 +98,8 @@ def localize(
         ),
     ],
     starts_per_task: Annotated[
-        int | None, typer.Option(help="Split the starts; default: no.")
+        int | None,
+        typer.Option(help="Split the starts; default: no.", rich_help_panel=STARTS),
     ] = None,
     dry_run: DryRun = False,
     as_json: AsJson = False,
@@ -117,7 +119,7 @@ def localize(
         "starts_per_task": starts_per_task,
         "memory": places.memory,
     }
-    opened, reading = open_store(store), reading_of(drive)
+    opened, reading = map_of(store), reading_of(drive)
     log = opened_log(reading)
     several = labels.scans_per_point
     shared = localize_drive.drive_overlap(
@@ -173,7 +175,7 @@ def _require_measured(labels: pd.DataFrame, drive: DriveMeasured) -> None:
     failed = labels[labels["status"] != "done"]
     if len(failed):
         reasons = {f"scan {s}": r for s, r in zip(failed["scan"], failed["reason"], strict=True)}
-        told = f"{drive.drive}: {len(failed)} of {len(labels)} scans failed:"
+        told = f"{drive.drive}: {len(failed):,} of {count_of(len(labels), 'scan')} failed:"
         raise PartialError(told, reasons)
     if why := unfit(labels):
         raise LimitError(f"{drive.drive}: {why}")
@@ -204,7 +206,7 @@ def factors(
     cluster: Cluster = HERE,
 ) -> None:
     """Compute the factors of the map at every sample point of a route."""
-    opened = open_store(store)
+    opened = map_of(store)
     with routes_of(route, places.project_to, places.spacing, opened, log) as (read, notes):
         routes = read.routes
         sensor, height, z = places.looking_sensor, places.sensor_height, places.route_z
@@ -291,7 +293,7 @@ def compare(
 ) -> None:
     """Compare lidars, ranges, resolutions of map and scan along routes, from the map alone."""
     check_threshold(cap, "--cap")
-    opened = open_store(store)
+    opened = map_of(store)
     with routes_of(route, places.project_to, places.spacing, opened, log) as (read, notes):
         routes = read.routes
         registration = labels.registration
@@ -366,5 +368,7 @@ def _show_comparison(content: dict[str, Any], store: str, folder: str, as_json: 
         say(f"The page is at {Files.at(folder).under('compare.html').address}")
     if not any(choice["estimated"] for choice in content["choices"]):
         reasons = content["choices"][0]["missing"]
-        failures = {str(reason): f"{count} sample points" for reason, count in reasons.items()}
+        failures = {
+            str(reason): count_of(count, "sample point") for reason, count in reasons.items()
+        }
         raise PartialError(f"{store}: no sample point has an estimate:", failures)

@@ -9,8 +9,11 @@ from rich.table import Table
 from tilestream.cli.options import AsJson, StoreUrl
 from tilestream.cli.printing import out, print_json, say, say_notes
 from tilestream.errors import PartialError
+from tilestream.files import Files
+from tilestream.pipeline.jobs.run_folder import map_of
+from tilestream.pipeline.jobs.run_state import record_of, state_told
 from tilestream.pipeline.jobs.sources import map_notes
-from tilestream.store import POINTS, TileStore, open_store
+from tilestream.store import POINTS, TileStore
 
 
 def status(
@@ -18,20 +21,24 @@ def status(
     as_json: AsJson = False,
 ) -> None:
     """Show the tiles of a store: counts, extents, status and reasons."""
-    opened = open_store(store)
+    opened, run = map_of(store), record_of(Files.at(store))
     marks = opened.marks(POINTS)
     failures = {f"tile {k}": m.reason for k, m in marks.items() if m.status == "failed"}
     failures |= {s["path"]: s["reason"] for s in opened.sources() if s["reason"]}
     condition = opened.condition()
     failures |= {} if condition.whole else {opened.url: str(condition)}
+    state = state_told(Files.at(store), run) if run else "whole"
+    failures |= {} if state == "whole" else {"the run": state}
     if as_json:
-        print_json(store_facts(opened))
+        print_json(store_facts(opened) | ({"run": state} if run else {}))
     else:
         out.print(tile_table(opened))
+        if run:
+            say(f"The run is {state}")
         say(f"The map is {condition}")
         say_notes(map_notes(opened))
     if failures:
-        raise PartialError(f"{store}: the map is not whole, or parts of it failed:", failures)
+        raise PartialError(f"{store} is not whole, or parts of it failed:", failures)
 
 
 def store_facts(store: TileStore) -> dict[str, Any]:

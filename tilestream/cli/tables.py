@@ -8,6 +8,7 @@ import pandas as pd
 from rich.box import SIMPLE
 from rich.table import Table
 
+from tilestream.counts import count_of
 from tilestream.factors.catalogue import COLUMNS
 from tilestream.report.diff.data import TILES, MapDiff
 from tilestream.report.drives import DriveMeasured
@@ -18,7 +19,9 @@ from tilestream.report.summary import digits_of
 
 def factor_table(rows: pd.DataFrame) -> Table:
     """The factors of a route: how they are spread."""
-    table = Table(title=f"factors of {len(rows)} sample points", title_justify="left", box=SIMPLE)
+    table = Table(
+        title=f"factors of {count_of(len(rows), 'sample point')}", title_justify="left", box=SIMPLE
+    )
     table.add_column("factor")
     for name in ("unit", "lowest", "median", "highest"):
         table.add_column(name, justify="right")
@@ -117,17 +120,17 @@ def diff_table(found: MapDiff) -> Table:
         table.add_row(f"tiles {kind}", count, " ".join(keys[:10]) + more)
     table.add_row("tiles the same", "not compared" if found.gone else f"{found.same:,}", "")
     places = found.places
-    table.add_row("compared", distance(places.length), f"{places.compared:,} sample points")
+    table.add_row("compared", distance(places.length), count_of(places.compared, "sample point"))
     by = f"by more than {cm(found.limit, 0)}"
     for what, rows in (("worse", places.worse), ("better", places.better)):
         length = distance(float(rows["length"].sum()))
-        table.add_row(f"got {what} {by}", length, f"{len(rows):,} sample points")
+        table.add_row(f"got {what} {by}", length, count_of(len(rows), "sample point"))
     if places.lost:
-        table.add_row("lost their estimate", "", f"{places.lost:,} sample points")
+        table.add_row("lost their estimate", "", count_of(places.lost, "sample point"))
     if places.appeared:
-        table.add_row("have one for the first time", "", f"{places.appeared:,} sample points")
+        table.add_row("have one for the first time", "", count_of(places.appeared, "sample point"))
     if len(places.left):
-        table.add_row("not asked for any more", "", f"{len(places.left):,} sample points")
+        table.add_row("not asked for any more", "", count_of(len(places.left), "sample point"))
     return table
 
 
@@ -163,7 +166,7 @@ def comparison_table(content: dict[str, Any]) -> Table:
         "lost",
         "map [MB]",
     ):
-        table.add_column(column, justify="right")
+        table.add_column(column, justify="right", min_width=max(map(len, column.split())))
     for choice in content["choices"]:
         figures = (choice[name] for name in ("median", "p95", "max", "over_share", "p_fail"))
         shown = ["none" if figure is None else f"{figure:.3f}" for figure in figures]

@@ -10,6 +10,7 @@ from rich.text import Text
 from tilestream.apps.scene import MOST_POINTS, Scene, scene_of
 from tilestream.apps.view import require_display, show
 from tilestream.cli.printing import out, say_notes
+from tilestream.counts import count_of
 from tilestream.grid import TileKey
 from tilestream.pipeline.jobs.run_folder import map_of
 from tilestream.pipeline.jobs.sources import map_notes
@@ -46,11 +47,13 @@ def view(
 def legend(scene: Scene) -> list[Text]:
     """What the points are, and what the colours of the places mean."""
     low, high = scene.height_range
-    told = f"map: {len(scene.points):,} of {scene.total:,} points, tiles: {len(scene.tiles):,}, "
+    told = f"map: {len(scene.points):,} of {count_of(scene.total, 'point')}, "
+    told += f"{count_of(len(scene.tiles), 'tile')}, "
     lines = [Text(told + f"from dark at {low:.1f} m to bright at {high:.1f} m")]
     measured, known = scene.measured.sum(), np.isfinite(scene.error).sum()
     if len(scene.places):
-        told = f"route: {measured:,} places measured (large), {known - measured:,} estimated "
+        told = f"route: {count_of(measured, 'place')} measured (large), "
+        told += f"{known - measured:,} estimated "
         between = int(scene.interpolated.sum())
         told += f"(small{f', {between:,} of them interpolated' if between else ''}), "
         lines.append(Text(told + f"{len(scene.places) - known:,} neither (grey)"))

@@ -1,9 +1,9 @@
 """Files of points, whatever their format: one protocol (base.py) and the registry below."""
 
-import glob
 import os
 from collections.abc import Iterable
 from dataclasses import replace
+from glob import has_magic
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from tilestream.formats.base import Block, PointSource, SourceInfo, Span, corner
 from tilestream.formats.drive import DRIVES
 from tilestream.formats.points import autoware, e57, las, pcd, ply
 from tilestream.formats.registry import Format, format_of, format_of_directory, format_of_ending
+from tilestream.patterns import paths_of
 
 __all__ = [
     "FORMATS",
@@ -130,14 +131,10 @@ def matches_of(pattern: str | os.PathLike[str]) -> list[str]:
         UsageError: a file that is not on this machine.
     """
     name = local_path(pattern)
-    if Path(name).exists():
-        return [name]
-    if not glob.has_magic(name):
-        raise SourceNotFoundError(f"{name}: no such file or directory; check the path")
-    named = sorted(glob.glob(name, recursive=True))  # noqa: PTH207  Path's is relative only
-    matches = [path for path in named if _is_meant(path)]
+    matches = [path for path in paths_of(name) if path == name or _is_meant(path)]
     if not matches:
-        raise SourceNotFoundError(f"{name}: the pattern matches no file; check the path")
+        what = ", and as a pattern it matches no file" if has_magic(name) else ""
+        raise SourceNotFoundError(f"{name}: no such file or directory{what}; check the path")
     return matches
 
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import numba
+from numba.core import event
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.dispatcher import Dispatcher
 
@@ -117,6 +118,32 @@ _KEPT = _settle()
 """Whether compiled kernels are kept."""
 _HELD: set[Path] = set()
 """The locks of kernels that this process compiles now."""
+
+
+class _FirstCompiled(event.Listener):
+    """Says so when the first kernel of this process is compiled; those on disk are only read."""
+
+    told = False
+
+    def on_start(self, event: Any) -> None:
+        """A kernel is not on disk."""
+        if not self.told and event.data["dispatcher"].py_func.__module__.startswith(_PACKAGE):
+            self.told = True
+            logger.info(COMPILING)
+
+    def on_end(self, event: Any) -> None:
+        """It is compiled."""
+
+
+_PACKAGE = f"{__name__.partition('.')[0]}."
+COMPILING = "compiling kernels, once per installation: a minute or more"
+event.register("numba:compile", _FirstCompiled())  # type: ignore[no-untyped-call]
+
+
+def are_kept() -> bool:
+    """Whether kernels are kept on disk from earlier: else the processes of a job compile them."""
+    folder = kept_in()
+    return folder is not None and any(folder.glob("*.nbi"))
 
 
 def kept_in() -> Path | None:

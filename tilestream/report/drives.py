@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from tilestream.counts import count_of
+
 EVALUATED = 0.5
 """Share of a drive, or of a route, that must have been evaluated where a gate opens."""
 TOLD = 3
@@ -50,7 +52,7 @@ class DriveMeasured:
     def __str__(self) -> str:
         """The headline of a drive."""
         why = f" ({self.why})" if self.reasons else ""
-        return f"measured {self.measured:,} of {self.scans:,} scans{why}"
+        return f"measured {self.measured:,} of {count_of(self.scans, 'scan')}{why}"
 
     def plain(self) -> dict[str, Any]:
         """Its fields, and `evaluated`, for machines."""

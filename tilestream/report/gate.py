@@ -8,6 +8,7 @@ import pandas as pd
 from pydantic import Field, field_validator
 
 from tilestream.config import Settings
+from tilestream.counts import count_of
 from tilestream.model.figures import SEGMENT
 from tilestream.report.data import interpolated
 from tilestream.report.drives import EVALUATED
@@ -116,8 +117,8 @@ def gate(
     missing = int(np.isnan(estimate).sum())
     if missing > MISSING * total:
         found.append(
-            f"{missing} of {total} sample points have no estimate, more than {MISSING:.0%}; "
-            "report/index.html lists why"
+            f"{missing:,} of {count_of(total, 'sample point')} without an estimate, more than "
+            f"{MISSING:.0%}; report/index.html lists why"
         )
     return found
 

@@ -3,6 +3,7 @@
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from tilestream.counts import count_of
 from tilestream.model.intervals import LEVEL
 from tilestream.report.formatting import cm_about, known, percent
 
@@ -148,4 +149,4 @@ class Worth:
 def _count(number: int | None, name: str) -> str:
     if not number:
         return ""
-    return f"{number:,} {name}{'' if number == 1 else 's'}"
+    return count_of(number, name)

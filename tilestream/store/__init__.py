@@ -22,6 +22,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from tilestream.counts import count_of
 from tilestream.errors import (
     DamagedError,
     IncompleteError,
@@ -71,7 +72,7 @@ class Tile:
 
     def __repr__(self) -> str:
         mark = self.mark(POINTS)
-        size = f"{mark.facts['points']:,} points" if mark.status == "done" else mark.reason
+        size = count_of(mark.facts["points"], "point") if mark.status == "done" else mark.reason
         return f"Tile {self.key} ({mark.status}: {size}) of {self.store.url}"
 
     def _repr_html_(self) -> str:
@@ -456,8 +457,9 @@ class TileStore:
     def __repr__(self) -> str:
         counts = [m.facts["points"] for m in self.marks().values() if m.status == "done"]
         return (
-            f"TileStore {self.url}: {len(counts)} tiles of {self.settings.tile_size:g} m, "
-            f"{sum(counts):,} points, CRS {self.settings.crs or 'local'}"
+            f"TileStore {self.url}: {count_of(len(counts), 'tile')} of "
+            f"{self.settings.tile_size:g} m, {count_of(sum(counts), 'point')}, "
+            f"CRS {self.settings.crs or 'local'}"
         )
 
     def _repr_html_(self) -> str:

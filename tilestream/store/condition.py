@@ -57,6 +57,6 @@ class Condition:
         """
         if not self.whole:
             raise IncompleteError(
-                f"{self.url} is {self}; --partial goes on without, and says so at every place that "
-                "could see what is missing"
+                f"{self.url} is {self}; partial (--partial) goes on without, and says so at every "
+                "place that could see what is missing"
             )

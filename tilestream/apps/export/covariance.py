@@ -6,7 +6,13 @@ from typing import Any, Literal
 import numpy as np
 
 from tilestream.apps.covariances import covariances
-from tilestream.apps.export.covariance_files import WRITERS, CovarianceExport, Format, summary
+from tilestream.apps.export.covariance_files import (
+    WRITERS,
+    CovarianceExport,
+    Format,
+    require_ours,
+    summary,
+)
 from tilestream.apps.runs import crs_of_map
 from tilestream.errors import UsageError
 from tilestream.files import Files
@@ -75,15 +81,16 @@ def export(
         the medians `along_m`, `across_m`, `yaw_deg` of the standard deviations, and of `p_lost`.
 
     Raises:
-        UsageError: no such route, a value that cannot be, or a run without covariances.
+        UsageError: no such route, a value that cannot be, a run without covariances, or a file is
+            in the way that is no earlier export of this format.
         SourceNotFoundError, IncompleteError, DamagedError: as `ts.covariances`.
         CrsError: a CRS that pyproj does not know.
 
     Examples:
-        >>> ts.export("covariance", "gone")
+        >>> ts.export("covariance", "gone")  # doctest: +ELLIPSIS
         Traceback (most recent call last):
         ...
-        tilestream.errors.SourceNotFoundError: gone: no tables of a run; `ts.run` writes some
+        tilestream.errors.SourceNotFoundError: gone: no tables of a run: give ...
     """
     if what != "covariance":
         raise UsageError(f"{what!r} cannot be exported: `covariance` can")
@@ -95,6 +102,7 @@ def export(
         raise UsageError(f"lost {lost!r}: give a share between 0 and 1")
     made = _made(place, every, inflate, route, threshold, lost)
     file = Files.at(place).under(f"export/{FILES[format]}") if out is None else Files.at(out)
+    require_ours(file, format)
     WRITERS[format](made, file)
     return summary(made) | {"file": file.address, "format": format}
 

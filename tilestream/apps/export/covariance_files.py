@@ -10,7 +10,7 @@ import pandas as pd
 
 from tilestream.apps.covariances import Covariances
 from tilestream.apps.export.poor_stretches import areas, poor_stretches
-from tilestream.apps.export.ros_parameters import ros_parameters
+from tilestream.apps.export.ros_parameters import USE, ros_parameters
 from tilestream.apps.runs import open_run
 from tilestream.errors import UsageError
 from tilestream.files import Files
@@ -233,6 +233,31 @@ def _write_autoware(made: CovarianceExport, file: Files) -> None:
         about,
     )
     write_text(file, text)
+
+
+BEGINS: Mapping[Format, str] = {
+    "autoware": f"# {USE[:40]}",
+    "csv": "route,arc_length_m,map_x_m,",
+    "json": '{\n "tilestream": ',
+}
+"""How each of these files begins."""
+
+
+def require_ours(file: Files, format: Format) -> None:  # noqa: A002 - as users call it
+    """Refuse to write over a file that is no earlier export of this format.
+
+    Raises:
+        UsageError: such a file is there.
+    """
+    try:
+        there = file.read()
+    except FileNotFoundError:
+        return
+    if there and not there.startswith(BEGINS[format].encode()):
+        raise UsageError(
+            f"{file.address} is there, and is no export of this format: name another file, or "
+            "remove it"
+        )
 
 
 WRITERS: Mapping[Format, Callable[[CovarianceExport, Files], None]] = {

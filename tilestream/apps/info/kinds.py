@@ -10,6 +10,7 @@ from importlib import import_module
 from pathlib import Path
 
 from tilestream.apps.info.record import Info
+from tilestream.apps.info.scenes import is_scene
 from tilestream.files import Files
 from tilestream.formats import FORMATS
 from tilestream.formats.logs import is_log
@@ -21,6 +22,8 @@ from tilestream.store import NODE
 
 MODEL = ".skops"
 """How a model's file ends."""
+COMPARISON = "compare.json"
+"""The figures of a comparison, in its folder."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,12 @@ KINDS = (
     Kind("tile stores", lambda _, names: NODE in names, "stores"),
     Kind("run directories", _is_run, "runs"),
     Kind(f"models ({MODEL})", _ends_in(MODEL), "models"),
+    Kind(
+        f"folders of `compare` (with {COMPARISON})",
+        lambda _, names: COMPARISON in names,
+        "comparisons",
+    ),
+    Kind("pictures for Foxglove", lambda path, _: is_scene(path), "scenes"),
     Kind("logs of drives", lambda path, _: is_log(path), "logs"),
     Kind("files and folders of points", _is_points, "points"),
     Kind("files of routes", _ends_in(*READERS), "routes"),

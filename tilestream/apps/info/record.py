@@ -21,7 +21,7 @@ class Info:
     path: str
     """As it was named."""
     kind: str
-    """One of `KINDS`: `points`, `log`, `routes`, `map`, `run`, `model`."""
+    """One of `KINDS`: `points`, `log`, `routes`, `map`, `run`, `model`, `comparison`, `scene`."""
     format: str
     """Name of the format, e.g. `pcd binary`, `mcap`, `Lanelet2`."""
     state: str = "whole"

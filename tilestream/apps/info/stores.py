@@ -5,6 +5,7 @@ from collections import Counter
 import numpy as np
 
 from tilestream.apps.info.record import Info, told
+from tilestream.counts import count_of
 from tilestream.pipeline.jobs.sources import map_notes
 from tilestream.settings import LogOptions
 from tilestream.store import POINTS, open_store
@@ -34,7 +35,7 @@ def described(path: str, _: LogOptions) -> Info:
         contents=[
             f"tiles of {settings.tile_size:g} m, thinned to {settings.map_leaf:g} m",
             *(
-                f"{one['path']}: {one['format']}, {one['points']:,} points"
+                f"{one['path']}: {one['format']}, {count_of(one['points'], 'point')}"
                 for one in store.sources()
             ),
         ],

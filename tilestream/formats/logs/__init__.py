@@ -1,7 +1,6 @@
 """Logs of drives, whatever their format: one protocol (base.py) and the registry below."""
 
 from functools import lru_cache
-from glob import glob, has_magic
 from pathlib import Path
 
 from tilestream.files import local_path
@@ -19,6 +18,7 @@ from tilestream.formats.registry import (
     format_of_ending,
     state_of,
 )
+from tilestream.patterns import paths_of
 from tilestream.settings import LogOptions
 
 __all__ = [
@@ -46,10 +46,9 @@ def is_log(path: str) -> bool:
     """Whether a path, or a glob of paths, is that of a log: by its ending, or a directory's marker;
     the content is not read.
     """
-    matches = glob(path, recursive=True) if has_magic(path) else ()  # noqa: PTH207
     return any(
         format_of_ending(match, LOG_FORMATS) or format_of_directory(match, LOG_FORMATS)
-        for match in (path, *matches)
+        for match in (path, *paths_of(path))
     )
 
 

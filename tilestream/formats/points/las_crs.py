@@ -92,4 +92,4 @@ def _unit(keys: dict[int, float], key: int) -> Unit | None:
 
 def _unreadable(error: CRSError) -> str:
     said = " ".join(str(error).split())[:200]
-    return f"its CRS cannot be read ({said}): taken as unknown, name it with --crs"
+    return f"its CRS cannot be read ({said}): taken as unknown, name it as crs (--crs)"

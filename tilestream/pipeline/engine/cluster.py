@@ -20,7 +20,9 @@ from distributed.comm.addressing import get_address_host
 from distributed.comm.core import CommClosedError
 from distributed.utils import silence_logging_cmgr
 
+from tilestream.counts import count_of
 from tilestream.errors import TaskError, UsageError
+from tilestream.kernels.cache import COMPILING, are_kept
 from tilestream.pipeline.engine.late_client import LateClient, around
 from tilestream.pipeline.engine.plan import megabytes
 from tilestream.pipeline.engine.seen import require_blocking
@@ -147,9 +149,8 @@ def _own_workers(memory: int, host: str, security: Any | None, count: int) -> It
             "though only certificates let them act",
             host,
         )
-    started = "a worker" if count == 1 else f"{count:,} workers"
-    told = "starting %s, encrypted; the first time, they compile kernels for a minute"
-    logger.info(told, started)
+    started = count_of(count, "worker")
+    logger.info("starting %s, encrypted%s", started, "" if are_kept() else f"; {COMPILING}")
     with (
         _local_cluster(
             n_workers=count,

@@ -56,8 +56,8 @@ def require_fit(task: Task, needed: int, memory: int) -> None:
     if needed > memory:
         raise PlanError(
             f"{task.key} needs {megabytes(needed)} and may use {megabytes(memory)}: "
-            "allow more with --memory, or make the pieces smaller (--tile-size, or a coarser "
-            "--map-leaf)"
+            "allow more memory (--memory), or make the pieces smaller: a smaller tile_size "
+            "(--tile-size) or a coarser map_leaf (--map-leaf)"
         )
 
 

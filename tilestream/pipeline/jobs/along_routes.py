@@ -303,5 +303,5 @@ def _tables_of(
     tables = paths_of(plan.outputs(stage))
     if failures:
         folder = tables[0].rsplit("/", 1)[0]
-        raise PartialError(f"{folder}: {counted(failures, 'tasks')}, the rest is done:", failures)
+        raise PartialError(f"{folder}: {counted(failures)}, the rest is done:", failures)
     return in_route_order(read_tables(tables), [route.route_id for route in routes])

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from tilestream.counts import count_of
 from tilestream.errors import StoreNotFoundError
 from tilestream.notes import MATCHER, Notes, noticed
 from tilestream.pipeline.engine.attempt import Outcome
@@ -145,7 +146,9 @@ def _expected_map(
     notes = [f"{path} is left out: {reason}" for path, reason in planned.left_out.items()]
     if tiles:
         count = len(expected.points)
-        notes.append(f"at most {count} tiles, by the bounds of the sources; reading tells which")
+        notes.append(
+            f"at most {count_of(count, 'tile')}, by the bounds of the sources; reading tells which"
+        )
     if unknown:
         notes.append(f"only reading tells where the points of {', '.join(unknown[:3])} are")
     sources = [source.record for source in planned.found]

@@ -103,7 +103,7 @@ def ingest(
         failures = reading.close(outcomes)
     if failures:
         raise PartialError(
-            f"{reading.store.url}: {counted(failures, 'sources or tiles')}, the rest is done:",
+            f"{reading.store.url}: {counted(failures)}, the rest is done:",
             failures,
         )
     return reading.store

@@ -130,7 +130,7 @@ def localize(
     )
     failures = make_tables(plan, out, client, watch)
     if failures:
-        raise PartialError(f"{out}: {counted(failures, 'tasks')}, the rest is done:", failures)
+        raise PartialError(f"{out}: {counted(failures)}, the rest is done:", failures)
     return read_tables(paths_of(plan.outputs(label.name)))
 
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Self
 
+from tilestream.counts import count_of
 from tilestream.errors import StoreError, UsageError
 from tilestream.grid import TileKey
 from tilestream.store import open_store
@@ -38,7 +39,7 @@ class Update:
         """
         limit, verb = ("at most ", "change") if at_most else ("", "changed")
         gone = f", {self.removed:,} removed" if self.removed else ""
-        told = f"map: {limit}{self.changed:,} of {self.of:,} tiles {verb}{gone}"
+        told = f"map: {limit}{self.changed:,} of {count_of(self.of, 'tile')} {verb}{gone}"
         counts = {f"tiles_{name}": count for name, count in asdict(self).items()}
         return {"told": told, "at_most": at_most, **counts}
 
@@ -52,7 +53,7 @@ class Update:
         """
         facts = self.facts(at_most=at_most)
         limit, verb = ("at most ", "are recomputed") if at_most else ("", "recomputed")
-        told = f"{facts['told']}; {limit}{made:,} of {places:,} places {verb}"
+        told = f"{facts['told']}; {limit}{made:,} of {count_of(places, 'place')} {verb}"
         return {**facts, "told": told, "places_recomputed": made, "places": places}
 
 

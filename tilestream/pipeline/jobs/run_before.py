@@ -14,7 +14,7 @@ from typing import Any
 
 import pandas as pd
 
-from tilestream.errors import DamagedError, UsageError
+from tilestream.errors import DamagedError, SourceNotFoundError, UsageError
 from tilestream.files import Files
 from tilestream.grid import TileKey
 from tilestream.marks import AGAIN, hash_of, sealed, unsealed
@@ -22,6 +22,7 @@ from tilestream.pipeline.jobs.map_update import Update
 from tilestream.pipeline.jobs.run_book import checksum_of, write_text
 from tilestream.pipeline.jobs.run_inputs import making_of
 from tilestream.pipeline.jobs.run_settings import RunSettings
+from tilestream.pipeline.jobs.run_state import record_of
 from tilestream.pipeline.stages.map_plan import MapPlan
 
 REPORT, BEFORE = "report", "before"
@@ -109,9 +110,13 @@ def before_update(run_dir: Files) -> tuple[Told, pd.DataFrame]:
     """The map and the places of a run before its last update.
 
     Raises:
+        SourceNotFoundError: there is no run directory.
         UsageError: the run has not been updated.
-        DamagedError: they are not what was written.
+        DamagedError: they, or the record of the run, are not what was written.
     """
+    if not run_dir.there():
+        raise SourceNotFoundError(f"{run_dir.address}: no run directory is there: check the path")
+    record_of(run_dir)
     before = run_dir.under(BEFORE)
     told = told_in(before)
     if told is None:

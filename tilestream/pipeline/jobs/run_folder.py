@@ -17,6 +17,7 @@ from tilestream.errors import (
 )
 from tilestream.files import Files
 from tilestream.pipeline.jobs.inventory import tables_in
+from tilestream.pipeline.jobs.run_state import record_of
 from tilestream.store import TileStore, open_store
 from tilestream.tables import read_mark, read_tables
 
@@ -30,9 +31,15 @@ def map_of(place: str | os.PathLike[str]) -> TileStore:
     Raises:
         StoreNotFoundError: nothing there, or the map is gone; says how to name its new place.
         IncompleteError: tables that do not tell, for their job has not ended.
+        DamagedError: the record of the run is not what was written.
         StoreError: something else lies there.
     """
     named = stores_named(place)
+    if not named and not Files.at(place).there():
+        raise StoreNotFoundError(
+            f"{place}: no tile store and no run directory is there: check the path; `tilestream "
+            f"ingest SOURCES --store {place}` makes a store, `tilestream estimate` a run"
+        )
     if not named:
         return open_store(place)
     for url in named:
@@ -55,8 +62,10 @@ def stores_named(place: str | os.PathLike[str]) -> list[str]:
 
     Raises:
         IncompleteError: nothing tells, and there are tables of a job that has not ended.
+        DamagedError: the record of the run is not what was written.
     """
     folder = Files.at(place)
+    record_of(folder)
     inside, job = folder.under("map.zarr"), job_of(folder)
     own = job.get("map") or {}
     found = [] if not job or own.get("store") else [inside.address]

@@ -3,12 +3,13 @@
 import os
 from collections.abc import Sequence
 from dataclasses import replace
-from glob import glob
 from pathlib import Path
 
+from tilestream.counts import count_of
 from tilestream.errors import UsageError
 from tilestream.formats.logs import is_log
 from tilestream.formats.routes import RoutesRead, read_all_routes, read_each
+from tilestream.patterns import paths_of
 from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.jobs.sources import crs_of_map
 from tilestream.store import open_store
@@ -50,11 +51,7 @@ def _sources(settings: RunSettings) -> tuple[list[Path], list[Path]]:
         known = [Path(source["path"]) for source in open_store(settings.store_url).sources()]
         sources = [path for path in known if path.exists()]
         return sources, [folder for path in known for folder in path.parents[:2]]
-    named = (
-        [name] if Path(name).exists() else sorted(glob(name))  # noqa: PTH207
-        for name in settings.map.sources
-    )
-    sources = [Path(name) for names in named for name in names]
+    sources = [Path(path) for name in settings.map.sources for path in paths_of(name)]
     return sources, sources
 
 
@@ -68,7 +65,7 @@ def _lanes(files: list[str], settings: RunSettings) -> tuple[RoutesRead, list[st
             f"{settings.out}: no routes: all {len(lanes)} lanes of {', '.join(files)} are shorter "
             f"than the spacing, {settings.spacing:g} m"
         )
-    many = f"{len(long)} lane{'' if len(long) == 1 else 's'}"
+    many = count_of(len(long), "lane")
     told = f"no routes were given: all streets of the map, {many} of {', '.join(files)}"
     short = len(lanes) - len(long)
     told += f"; {short} shorter than the spacing are left out" if short else ""

@@ -113,7 +113,7 @@ def simulate(
         if not failures:
             shutil.rmtree(folder / "parts", ignore_errors=True)
     if failures:
-        raise PartialError(f"{folder}: {counted(failures, 'tasks')}, the rest is done:", failures)
+        raise PartialError(f"{folder}: {counted(failures)}, the rest is done:", failures)
     return folder
 
 
@@ -266,7 +266,7 @@ def require_space(folder: Path, needed: int) -> None:
     if needed > free:
         raise PlanError(
             f"{folder}: the simulation may need {needed / 1e9:.1f} GB and {free / 1e9:.1f} GB are "
-            "free: give another directory, fewer --paths or --size small"
+            "free: give another directory, fewer paths (--paths) or size small (--size small)"
         )
 
 

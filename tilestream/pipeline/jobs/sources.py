@@ -149,7 +149,7 @@ def within(found: Sequence[Source], memory: int) -> list[Source]:
     needed = {s.path: needed_to_open(s.info) for s in found if s.info is not None}
     if all(need > memory for need in needed.values()):
         return list(found)
-    told = "needs {} to be opened and may use {}: allow more with --memory"
+    told = "needs {} to be opened and may use {}: allow more memory (--memory)"
     return [
         replace(s, info=None, reason=told.format(megabytes(needed[s.path]), megabytes(memory)))
         if needed.get(s.path, 0) > memory
@@ -170,7 +170,7 @@ def as_read(source: Source, indices: Sequence[Fragment], kept: Kept) -> Source:
     told = kept.notes
     if left_out:
         why = "points of a class of noise (7 or 18) or withheld are left out"
-        told += (f"{left_out:,} {why}; --keep-noise keeps them",)
+        told += (f"{left_out:,} {why}; keep_noise (--keep-noise) keeps them",)
     dropped = sum(index.dropped for index in indices)
     return replace(source, told=told, points=kept.points, dropped=dropped)
 

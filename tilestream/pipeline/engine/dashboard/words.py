@@ -4,6 +4,7 @@ import html
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from tilestream.counts import count_of
 from tilestream.pipeline.engine.dashboard.map import COLOURS, HATCHES
 from tilestream.pipeline.engine.plan import megabytes
 from tilestream.pipeline.engine.progress import STATUSES
@@ -64,8 +65,8 @@ def head_html(facts: Mapping[str, Any]) -> str:
         for names in (STATUSES, STATUSES[2:])
     )
     share = facts["share_done"]
-    sizes = [f"{ended:,} of {_many(tasks, 'task')}", _many(facts["map"]["tiles"], "tile")]
-    sizes.append(_many(len(facts["workers"]), "worker"))
+    sizes = [f"{ended:,} of {count_of(tasks, 'task')}", count_of(facts["map"]["tiles"], "tile")]
+    sizes.append(count_of(len(facts["workers"]), "worker"))
     then = {
         "running": f"<b>{left_words(facts['left'])}</b>",
         "ended": "",
@@ -114,7 +115,7 @@ def legend_html(seen: Mapping[str, Any]) -> str:
     where = html.escape(seen["crs"] or "local frame") if seen["tile_m"] else ""
     told = [f"<span class='soft'>{where}</span>"]
     if seen["places"]:
-        many = f"{seen['places']:,} places"
+        many = count_of(seen["places"], "place")
         fewer = seen["places_kept"] < seen["places"]
         worst = f", of squares of {seen['worst_of_squares_m']:g} m the worst" if fewer else ""
         told.insert(0, f"<span class='soft'>{many}{worst}</span>")
@@ -161,7 +162,7 @@ def workers_html(workers: Sequence[Mapping[str, Any]], promise: int) -> str:
     promised = f"memory: {megabytes(promise)} promised" if promise else "memory"
     shown = _table(("worker", promised, "now", "at most"), lines[:MOST_WORKERS])
     more = len(lines) - MOST_WORKERS
-    rest = f"and {more:,} workers that have used less" if more > 0 else ""
+    rest = f"and {count_of(more, 'worker')} that used less" if more > 0 else ""
     return f"<h2>Workers</h2>{shown}{rest}"
 
 
@@ -175,9 +176,13 @@ def failures_html(facts: Mapping[str, Any]) -> str:
     then = f", {not_run:,} not run because of that" if not_run else ""
     reasons = facts["reasons"]
     lines = "".join(f"<li>{html.escape(line)}</li>" for line in reasons[:MOST_REASONS])
-    more = [f"{len(reasons) - MOST_REASONS:,} more reasons"] if len(reasons) > MOST_REASONS else []
+    more = (
+        [count_of(len(reasons) - MOST_REASONS, "more reason")]
+        if len(reasons) > MOST_REASONS
+        else []
+    )
     unread = facts["failures_not_listed"]
-    more += [f"{unread:,} more failures"] if unread else []
+    more += [count_of(unread, "more failure")] if unread else []
     rest = f"<span class='soft'>and {', '.join(more)}: the run lists them</span>" if more else ""
     return f"<h2>Failures: {failed:,} failed{then}</h2><ul>{lines}</ul>{rest}"
 
@@ -205,10 +210,6 @@ def _table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
 
     body = "".join(line(cells, "td") for cells in lines)
     return f"<table>{line(head, 'th')}{body}</table>"
-
-
-def _many(count: int, what: str) -> str:
-    return f"{count:,} {what}" if count == 1 else f"{count:,} {what}s"
 
 
 def clock(seconds: float) -> str:
