@@ -5,7 +5,8 @@
 All are estimates from the map alone by the model that ships, `physics` with `--model`. CPU time is
 of this one process, warm, and without what is made of the map alone. Within tolerance is what a run
 of all places says; what a coarse run says of itself stands beside it. A hot spot is a place over
-the threshold; it is missed where it is only interpolated, below it.
+the threshold; it is missed where it is only interpolated, below it. Misses and biases are of the
+interpolated places, interpolated less evaluated, of each route the mean.
 """
 
 import argparse
@@ -47,7 +48,7 @@ from tilestream.factors.stations import INTERPOLATED
 COLUMNS = (
     *("every", "tolerance [cm]", "first round", "virtual drives", "rounds", "CPU s", "of all"),
     *("interpolated", "within tolerance", "of interpolated", "off, as checked"),
-    *("largest miss [cm]", "hot spots missed"),
+    *("mean miss [cm]", "largest", "bias", "of a route, at most", "hot spots missed"),
 )
 
 
@@ -77,6 +78,8 @@ def row(run: Path, whole: pd.DataFrame, seconds: float, all_seconds: float, limi
     told = json.loads((run / "run.json").read_text())["coarse"]
     found = places_of(run).reindex(whole.index)
     between = (found["status"] == INTERPOLATED).to_numpy()
+    difference = (found["estimate"] - whole["estimate"])[between] * 100.0
+    of_routes = difference.groupby("route_id").mean()
     off = (found["estimate"] - whole["estimate"]).abs().to_numpy()
     known = whole["estimate"].notna().to_numpy() | between
     within = np.nan_to_num(off, nan=np.inf) <= told["tolerance"]
@@ -98,7 +101,10 @@ def row(run: Path, whole: pd.DataFrame, seconds: float, all_seconds: float, limi
         f"{within[known].mean():.1%}",
         f"{within[between].mean():.1%}" if between.any() else "none",
         checked,
-        f"{100 * np.nanmax(off):.1f}",
+        f"{difference.abs().mean():.2f}",
+        f"{difference.abs().max():.1f}",
+        f"{difference.mean():+.2f}",
+        f"{of_routes[of_routes.abs().idxmax()]:+.2f}" if between.any() else "none",
         f"{missed.sum()}/{hot.sum()}",
     )
     return f"| {' | '.join(map(str, figures))} |"

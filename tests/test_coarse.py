@@ -62,7 +62,7 @@ def test_first_stations_are_evenly_spread_and_one_place_in_so_many(places: int, 
     assert np.ptp(np.diff(stations)) <= 1 if len(stations) > 1 else places == 1
     taken |= support(stations, taken, half)
     assert known(taken, taken, half)[stations].all()
-    between = probes(stations, half, 8)
+    between = probes(stations, 8)
     assert not np.isin(between, stations).any()
     assert np.ptp(np.diff(np.union1d(stations, between))) <= 2 if places > 1 else not between.size
     taken[between] = True
@@ -152,25 +152,37 @@ def test_nothing_is_interpolated_that_is_high_or_between_what_differs(every: int
     assert (route[:, 0] == route[:, 1]).all()  # nothing between two routes
     outside = np.setdiff1d(np.arange(len(estimate)), inside)
     assert taken[outside].all()
+    pairs, whole = coarse.between
+    assert taken[pairs].all()
+    assert np.isfinite(estimate[pairs]).all()
+    own = pairs[~whole, 1]
+    assert sorted(pairs[whole, 1]) == sorted(ends[:, 1])
+    assert own.tolist() == inside[taken[inside] & np.isfinite(estimate[inside])].tolist()
+    assert told.alone == len(own) > 0
+    steps = np.concatenate([np.arange(a + 1, b + 1) for a, b in pairs.tolist()])
+    assert np.setdiff1d(steps, ends[:, 1]).tolist() == np.setdiff1d(inside, ends[:, 1]).tolist()
 
 
 def test_the_check_tells_how_often_what_is_interpolated_is_off() -> None:
     """Over many draws it tells the share that a full run finds."""
-    lengths = {"a": 3000, "b": 2000}
+    lengths, how = {"a": 3000, "b": 2000}, {"every": 32, "tolerance": 0.02}
     estimate = estimates_of(lengths, 1)
-    coarse, _, _ = evaluated(estimate, lengths, checks=0, tolerance=0.02)
-    inside, ends = coarse.interpolated, np.unique(coarse.gaps)
-    said = np.interp(inside, ends, estimate[ends])
+    coarse, taken, _ = evaluated(estimate, lengths, checks=0, **how)
+    inside, there = coarse.interpolated, np.flatnonzero(taken & np.isfinite(estimate))
+    said = np.interp(inside, there, estimate[there])
     truth = float((~(np.abs(said - estimate[inside]) <= 0.02)).mean())
     assert coarse.told().off_share is None
     told: list[Told] = [
-        evaluated(estimate, lengths, seed=seed, tolerance=0.02)[0].told() for seed in range(60)
+        evaluated(estimate, lengths, seed=seed, **how)[0].told() for seed in range(60)
     ]
     checked, off = sum(one.checked for one in told), sum(one.off for one in told)
     assert 0.02 < truth < 0.5
     assert off / checked == pytest.approx(truth, abs=3 * np.sqrt(truth / checked))
     held = [one.off_low <= truth <= one.off_high for one in told]  # type: ignore[operator]
     assert np.mean(held) > 0.85
+    bias = float(np.nanmean(said - estimate[inside]))
+    biases = [one.off_bias * one.checked for one in told]  # type: ignore[operator]
+    assert sum(biases) / checked == pytest.approx(bias, abs=0.001)
 
 
 def test_places_that_are_lost_are_evaluated_up_to_and_not_beyond() -> None:

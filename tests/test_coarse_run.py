@@ -18,6 +18,7 @@ from tilestream.apps.scene import scene_of
 from tilestream.cli import run as command
 from tilestream.cli.viewing import legend
 from tilestream.errors import ModelError, PartialError, UsageError
+from tilestream.factors.along_route import WIDTH, averaged_along
 from tilestream.factors.stations import INTERPOLATED
 from tilestream.model.covariance import COVARIANCE_COLUMNS
 from tilestream.model.training import PREDICTION_COLUMNS
@@ -26,7 +27,7 @@ from tilestream.pipeline.jobs.forecast import forecast
 from tilestream.pipeline.jobs.run_folder import rows_of
 from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.stages import observe as observe_stage
-from tilestream.pipeline.stages.between import NAMES, Between
+from tilestream.pipeline.stages.between import ALONE, NAMES, Between
 from tilestream.report import cards, gate, pictures, write_report
 from tilestream.report.summary import summary
 
@@ -117,17 +118,35 @@ def test_what_is_evaluated_has_the_bits_of_a_full_run(full: Path, coarse: Path) 
 def test_the_rest_is_linear_along_the_route_and_has_nothing_else(coarse: Path) -> None:
     found = predictions(coarse)
     for _, route in found.groupby("route_id"):
-        own = route[route["status"] == "done"]
+        own = route[(route["status"] == "done") | (route["reason"] == ALONE)]
         for name in NAMES:
             line = np.interp(route["arc_length"], own["arc_length"], own[name])
             np.testing.assert_allclose(route[name], line, rtol=0, atol=1e-9)
-        ends = own[["sample", "estimate"]].to_numpy()
+        ends = route.loc[route["status"] == "done", ["sample", "estimate"]].to_numpy()
         apart = np.diff(ends, axis=0)
         assert (np.abs(apart[apart[:, 0] > 1, 1]) <= COARSE["tolerance"]).all()
     between = found[found["status"] == INTERPOLATED]
     blank = ["low", "high", "domain_distance", "in_domain", "cov_along_along", "p_lost", "nvtl"]
     assert between[blank].isna().all().all()
-    assert between["reason"].str.match(r"interpolated between sample points \d+ and \d+$").all()
+    alone = between["reason"] == ALONE
+    told = between.loc[~alone, "reason"]
+    assert told.str.match(r"interpolated between sample points \d+ and \d+$").all()
+    assert 0 < alone.sum() == json.loads((coarse / "run.json").read_text())["coarse"]["alone"]
+
+
+def test_a_virtual_drive_in_a_gap_is_of_use_there(coarse: Path) -> None:
+    """The estimate is that of as much of its kernel as was taken, and the places beside it lie on
+    lines to it."""
+    found, drives = predictions(coarse), rows_of(coarse, "observability")
+    assert drives is not None
+    taken = pd.MultiIndex.from_frame(drives[["route_id", "sample"]])
+    places = pd.MultiIndex.from_frame(found[["route_id", "sample"]])
+    alone = (found["reason"] == ALONE).to_numpy()
+    assert (places.isin(taken) == alone | (found["status"] == "done").to_numpy()).all()
+    columns = ["vd_mean"]
+    averaged = averaged_along(drives, WIDTH, columns)[columns].set_index(taken)["vd_mean"]
+    expected = averaged.reindex(places)[alone].to_numpy()
+    assert found["estimate"][alone].tolist() == expected.tolist()
 
 
 def test_it_is_told_apart_wherever_it_shows(coarse: Path) -> None:
@@ -141,7 +160,8 @@ def test_it_is_told_apart_wherever_it_shows(coarse: Path) -> None:
     assert told["first"] < 0.5 * told["evaluated"]
     assert 0 < told["checked"] <= 4
     assert told["off_low"] <= told["off_share"] == told["off"] / told["checked"] <= told["off_high"]
-    assert 0.0 <= told["off_mean"] <= told["off_most"]
+    assert abs(told["off_bias"]) <= told["off_mean"] <= told["off_most"]
+    assert told["off_of"] > 0.0
     assert ts.info(coarse).plain()["coverage"]["places_interpolated"] == between.sum()
     shown = scene_of(coarse)
     assert shown.interpolated.sum() == between.sum()
@@ -248,7 +268,7 @@ def test_a_tile_that_fails_is_left_out_as_of_any_run(
 def test_a_place_in_a_gap_that_the_map_knows_nothing_of_has_no_estimate() -> None:
     """And of two routes each has its own gaps."""
     values = np.arange(2 * 2 * len(NAMES), dtype=float).reshape(2, 2, len(NAMES))
-    between = Between(("r", "r"), np.array([[2, 6], [8, 10]]), values)
+    between = Between(("r", "r"), np.array([[2, 6], [8, 10]]), np.array([True, True]), values)
     places = pd.DataFrame(
         {
             "route_id": ["r"] * 12 + ["s"] * 2,
@@ -273,6 +293,10 @@ def test_a_place_in_a_gap_that_the_map_knows_nothing_of_has_no_estimate() -> Non
     assert found.loc[4, ["status", "reason"]].tolist() == ["missing", "no ground"]
     assert found.loc[4, list(NAMES)].isna().all()
     assert (found.drop(index=[*inside, 4])[list(NAMES)] == 7.0).all().all()
+    found = replace(between, whole=np.array([False, True])).filled(places, there, evaluated)
+    assert np.flatnonzero(found["status"] == INTERPOLATED).tolist() == [3, 5, 6, 9]
+    assert found.loc[6, list(NAMES)].tolist() == values[0, 1].tolist()
+    assert found.loc[6, "reason"] == ALONE != found.loc[5, "reason"]
 
 
 # --- Before it runs

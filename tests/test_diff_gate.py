@@ -21,7 +21,13 @@ def places(route: str = "r", **columns: object) -> pd.DataFrame:
     """Places a metre apart."""
     x = np.arange(float(N))
     at = {"route_id": route, "sample": np.arange(N), "arc_length": x, "x": x, "y": 0.0, "z": 2.0}
-    parts: dict[str, Any] = {"estimate": 0.1, "along": 0.05, "p_fail": 0.0, "reason": ""}
+    parts: dict[str, Any] = {
+        "estimate": 0.1,
+        "along": 0.05,
+        "p_fail": 0.0,
+        "reason": "",
+        "status": "done",
+    }
     return pd.DataFrame(at | parts | columns)
 
 

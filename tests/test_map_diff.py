@@ -16,11 +16,12 @@ from map_diffs import words
 from scenes import scene
 
 import tilestream as ts
-from tilestream.apps.changes import NOTHING, changes
+from tilestream.apps.changes import BETWEEN, NOTHING, changes
 from tilestream.apps.diff import diff
 from tilestream.cli import run
 from tilestream.errors import DamagedError, StoreNotFoundError, UsageError
 from tilestream.factors.rows import PLACE_COLUMNS
+from tilestream.factors.stations import INTERPOLATED
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.marks import Mark
 from tilestream.model.phrases import NO_POLES, SLIDES_ALONG
@@ -103,7 +104,7 @@ def places(**columns: object) -> pd.DataFrame:
     """Ten places a metre apart."""
     x = np.arange(10.0)
     at = {"route_id": "r", "sample": np.arange(10), "arc_length": x, "x": x, "y": 0.0, "z": 2.0}
-    return pd.DataFrame(at | {"heading": 0.0, "estimate": 0.1} | columns)
+    return pd.DataFrame(at | {"heading": 0.0, "estimate": 0.1, "status": "done"} | columns)
 
 
 def test_why_an_estimate_grew_is_the_part_and_the_factor_that_changed() -> None:
@@ -120,6 +121,10 @@ def test_why_an_estimate_grew_is_the_part_and_the_factor_that_changed() -> None:
     )
     same = changes(old, old.assign(estimate=grown), 0.02)
     assert same.worse["why"].tolist() == [NOTHING]
+    status = np.where(np.arange(10) == 4, INTERPOLATED, "done")
+    for one, other in ((old.assign(status=status), old), (old, old.assign(status=status))):
+        unsure = changes(one, other.assign(estimate=grown), 0.02)
+        assert unsure.worse["why"].tolist() == [BETWEEN]
 
 
 def test_a_place_whose_map_is_gone_has_lost_its_estimate() -> None:

@@ -11,6 +11,7 @@ from tilestream.model.features import with_derived
 from tilestream.model.phrases import PHRASES, REASSURING, phrase_of
 from tilestream.model.training import ESTIMATES, MAIN
 from tilestream.records import Float64
+from tilestream.report.data import interpolated
 from tilestream.report.diff.data import ENDS, OTHERS, Changes
 
 SAME_PLACE = 0.5
@@ -24,9 +25,11 @@ UNITS = {column.name: column.unit for column in (*catalogue.COLUMNS, *observabil
 PARTS = {name: name for target, name in ESTIMATES.items() if target != MAIN}
 """The parts of an estimate, where nothing is known of the virtual drive."""
 NOTHING = "its factors are as they were: the model is another one"
-"""Why an estimate changed where no factor did."""
+"""Why an estimate changed where no factor did …"""
+BETWEEN = "its factors are as they were: an estimate of it is interpolated, not evaluated"
+"""… and where one of the two was not evaluated."""
 AT = ["route_id", "sample", "arc_length", "x", "y", "z"]
-COMPARED = ["before", "after", "why", "reason"]
+COMPARED = ["before", "after", "why", "reason", "interpolated_before", "interpolated_after"]
 LEFT = ["route_id", "arc_length", "x", "y", "before"]
 
 
@@ -46,6 +49,10 @@ def changes(old: pd.DataFrame | None, new: pd.DataFrame | None, limit: float) ->
     others = {
         f"{name}_{when}": table[name].to_numpy(np.float64) if name in table else np.nan
         for name in (*OTHERS, *ENDS)
+        for when, table in (("before", then), ("after", now))
+    }
+    others |= {
+        f"interpolated_{when}": interpolated(table) & table["estimate"].notna()
         for when, table in (("before", then), ("after", now))
     }
     reason = now["reason"].fillna("").astype(str) if "reason" in now else ""
@@ -100,6 +107,7 @@ def _reasons(then: pd.DataFrame, now: pd.DataFrame, rows: np.ndarray) -> list[st
     if not rows.size:
         return []
     old, new = (with_derived(table.copy()) for table in (then, now))
+    between = interpolated(then) | interpolated(now)
     both = [name for name in PHRASES if name in old and name in new]
     causes = [name for name in both if not name.startswith("vd_")]
     a, b = (table[causes].to_numpy(np.float64) for table in (old, new))
@@ -108,7 +116,7 @@ def _reasons(then: pd.DataFrame, now: pd.DataFrame, rows: np.ndarray) -> list[st
     had, has = (table[parts].to_numpy(np.float64) for table in (old, new))
     return [
         "; ".join(filter(None, [_part(parts, had, has, row), _cause(causes, a, b, away, row)]))
-        or NOTHING
+        or (BETWEEN if between[row] else NOTHING)
         for row in rows.tolist()
     ]
 

@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 from scipy.spatial import cKDTree
 
+from tilestream.apps.run_plot import ESTIMATED, plot_places
 from tilestream.bounded_yaml import parse_yaml
 from tilestream.counts import count_of
 from tilestream.errors import (
@@ -29,18 +30,15 @@ from tilestream.errors import (
 )
 from tilestream.factors.rows import PLACE_COLUMNS
 from tilestream.files import Files, place_of
-from tilestream.model.covariance import COVARIANCE_COLUMNS
 from tilestream.model.join import ON_PATH
-from tilestream.model.training import ESTIMATES, MAIN, PREDICTION_COLUMNS
-from tilestream.notebook import axes_of, html_of
+from tilestream.model.training import ESTIMATES, MAIN
+from tilestream.notebook import html_of
 from tilestream.pipeline.jobs.run_book import ENDED, content_as_written
 from tilestream.pipeline.jobs.run_folder import map_of, rows_of, table_paths
 from tilestream.pipeline.jobs.run_inputs import seen_otherwise
 from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.jobs.run_state import record_of
-from tilestream.records import Float64
-from tilestream.report.colours import FIXED, MISSING, scale_of
-from tilestream.report.formatting import CM_PER_M
+from tilestream.report.data import interpolated
 from tilestream.store import TileStore
 from tilestream.tables import read_tables
 
@@ -49,7 +47,6 @@ REPORT = "report/report.json"
 PLACES = "report/places.parquet"
 """The places of a run that has ended, in its directory."""
 PLACE = [column.name for column in PLACE_COLUMNS]
-ESTIMATED = [column.name for column in (*PREDICTION_COLUMNS, *COVARIANCE_COLUMNS)]
 MEASURED = {
     target: "measured" if target == MAIN else f"measured_{name}"
     for target, name in ESTIMATES.items()
@@ -261,7 +258,7 @@ class Run:
 
     def plot(self, column: str | None = None, ax: Any | None = None) -> Any:
         """Its streets from above, coloured by error: large where measured, small where estimated,
-        grey crosses where neither is known; the axes.
+        a dot where that is interpolated, grey crosses where neither is known; the axes.
 
         Args:
             column: a column of the table to colour by instead, e.g. a factor.
@@ -273,22 +270,7 @@ class Run:
         table = self.table
         if column is not None and (column not in table or table[column].dtype.kind not in "iufb"):
             raise UsageError(f"{self.place}: {column!r} is no column of numbers: see `.table`")
-        small = _numbers(table, column or "estimate")
-        large = _numbers(table, "measured" if column is None else "")
-        scale = FIXED if column is None else scale_of(small)
-        ax = axes_of(ax)
-        for values, size in ((small, 8.0), (large, 30.0)):
-            rows = np.flatnonzero(~np.isnan(values))
-            rows = rows[np.argsort(values[rows], kind="stable")]  # the worst on top
-            shades = scale.shades(values[rows])
-            ax.scatter(table["x"].iloc[rows], table["y"].iloc[rows], s=size, c=shades, lw=0)
-        neither = table[np.isnan(small) & np.isnan(large)]
-        ax.scatter(neither["x"], neither["y"], s=12.0, c=MISSING, marker="x", lw=1.0)
-        per_metre, label = (
-            (CM_PER_M, "localization error [cm]") if column is None else (1.0, column)
-        )
-        ax.figure.colorbar(scale.mappable(per_metre), ax=ax, label=label)
-        return ax
+        return plot_places(table, column, ax)
 
     def _repr_html_(self) -> str:
         table = self.table
@@ -301,16 +283,11 @@ class Run:
                 known = table[name].dropna()
                 spans = f", {known.min():.3f} to {known.max():.3f} m" if len(known) else ""
                 facts[told] = f"{count_of(len(known), 'place')}{spans}"
+        if "status" in table and (between := int(interpolated(table).sum())):
+            facts["interpolated"] = f"{between:,} of them: not evaluated"
         if self.report:
             facts["report"] = f"{self.place}/report/index.html"
         return html_of(f"Run {self.place}", facts)
-
-
-def _numbers(table: pd.DataFrame, name: str) -> Float64:
-    """(n,) a column; NaN where the table has none of that name."""
-    if name not in table:
-        return np.full(len(table), np.nan)
-    return table[name].to_numpy(np.float64)
 
 
 def open_run(place: str | os.PathLike[str]) -> Run:

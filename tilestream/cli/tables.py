@@ -10,6 +10,7 @@ from rich.table import Table
 
 from tilestream.counts import count_of
 from tilestream.factors.catalogue import COLUMNS
+from tilestream.factors.stations import INTERPOLATED
 from tilestream.report.diff.data import TILES, MapDiff
 from tilestream.report.drives import DriveMeasured
 from tilestream.report.formatting import cm, cm_about, distance
@@ -98,6 +99,7 @@ def report_table(report: dict[str, Any], figures: Sequence[tuple[str, str]]) -> 
         table.add_row(*(" ".join(text.split()) for text in (figure, meaning)))  # plain spaces
     for worst in report["worst"][:3]:
         where = f"on {worst['route_id']} at {worst['arc_length']:.0f} m, of the worst places"
+        where += ", interpolated" if worst["status"] == INTERPOLATED else ""
         estimate = cm_about(worst["estimate"], digits_of(report))
         table.add_row(" ".join(estimate.split()), where)
     return table
@@ -121,6 +123,9 @@ def diff_table(found: MapDiff) -> Table:
     table.add_row("tiles the same", "not compared" if found.gone else f"{found.same:,}", "")
     places = found.places
     table.add_row("compared", distance(places.length), count_of(places.compared, "sample point"))
+    if places.compared_interpolated:
+        between = f"{places.compared_interpolated:,} of these, before or after"
+        table.add_row("interpolated, not evaluated", "", between)
     by = f"by more than {cm(found.limit, 0)}"
     for what, rows in (("worse", places.worse), ("better", places.better)):
         length = distance(float(rows["length"].sum()))
@@ -146,7 +151,9 @@ def stretch_table(found: MapDiff) -> Table:
     for row in rows.head(STRETCHES).to_dict("records"):
         where = (f"{row[name]:.0f} m" for name in ("begin", "end", "at"))
         errors = (cm(row[name]) for name in ("before", "after"))
-        table.add_row(str(row["route_id"]), *where, *errors, row["why"])
+        between = f"{row['interpolated']:,} of {row['places']:,} places interpolated"
+        why = [row["why"], *([between] if row["interpolated"] else [])]
+        table.add_row(str(row["route_id"]), *where, *errors, "; ".join(why))
     return table
 
 

@@ -40,7 +40,9 @@ class Told:
     evaluated: int
     """Virtual drives of all rounds."""
     interpolated: int
-    """Places that are interpolated."""
+    """Places that are interpolated …"""
+    alone: int
+    """… of which so many have a virtual drive, but not all that their estimate averages."""
     rounds: int
     """How many rounds there were."""
     checked: int
@@ -50,7 +52,11 @@ class Told:
     off_mean: float | None
     """How far off those were that had one, in the mean [m]; None: none was checked …"""
     off_most: float | None
-    """… and at most."""
+    """… at most …"""
+    off_bias: float | None
+    """… and with its sign: above 0, they were interpolated too high; None: none was checked."""
+    off_of: float | None
+    """What they were evaluated to, in the mean [m]; None: none was checked."""
     off_share: float | None
     """Share of these; None: none was checked …"""
     off_low: float | None
@@ -68,24 +74,28 @@ class Told:
         )
         if not n:
             return f"{said}, none is interpolated."
-        said += f"; {n:,} others are not evaluated: where they have ground, they are interpolated "
-        said += "along their route. "
+        said += f"; {n:,} others are interpolated along their route where they have ground, "
+        said += f"{self.alone:,} of them through a virtual drive of their own. "
         if self.off_share is None:
             return f"{said}None of them was checked: how often they are off is not known."
         centimetres = f"{100.0 * self.tolerance:g} cm"
         return (
             f"{said}Of {self.checked:,} such places that were checked by lot {self.off:,} were off "
             f"by more than {centimetres}: {self.off_share:.0%} ({self.off_low:.0%} to "
-            f"{self.off_high:.0%}){self._by}."
+            f"{self.off_high:.0%}).{self._by}"
         )
 
     @property
     def _by(self) -> str:
         """By how much, in words."""
-        if self.off_mean is None or self.off_most is None:
+        mean, most, bias, of = self.off_mean, self.off_most, self.off_bias, self.off_of
+        if mean is None or most is None or bias is None or of is None:
             return ""
+        cm = [f"{100.0 * length:.1f}" for length in (of, mean, most, abs(bias))]
+        side = "low" if bias < 0.0 else "high"
         return (
-            f"; by {100.0 * self.off_mean:.1f} cm on average, at most {100.0 * self.off_most:.1f}"
+            f" They were evaluated to {cm[0]} cm on average; interpolated they were off by {cm[1]} "
+            f"cm on average, at most {cm[2]}, and in the mean {cm[3]} cm too {side}."
         )
 
     def plain(self) -> dict[str, object]:
@@ -111,7 +121,7 @@ class Coarse:
         self._estimate = np.full(total, np.nan)
         self._checked: Int64 | None = None
         self._said = np.zeros(0)  # of the checked places, before they were evaluated [m]
-        self._difference = np.zeros(0)  # of those from what they were evaluated to [m]
+        self._found = np.zeros(0)  # what they were evaluated to [m]
         self._first = self._rounds = 0
 
     def next(self) -> Int64:
@@ -163,30 +173,49 @@ class Coarse:
         inside = [np.arange(a + 1, b) for a, b in self.gaps.tolist()]
         return np.concatenate([*inside, np.zeros(0, np.int64)])
 
+    @property
+    def between(self) -> tuple[Int64, NDArray[np.bool_]]:
+        """(k, 2) the places with an estimate between which the gaps are interpolated, one behind
+        the other, each pair of one gap; (k,) whether the second is the end of its gap, and not in
+        it with the estimate of as much of its kernel as is taken.
+        """
+        there = np.isfinite(self._estimate)
+        pairs, ends = [np.zeros((0, 2), np.int64)], [np.zeros(0, bool)]
+        for a, b in self.gaps.tolist():
+            at = a + np.flatnonzero(there[a : b + 1])
+            pairs.append(np.column_stack([at[:-1], at[1:]]))
+            ends.append(at[1:] == b)
+        return np.concatenate(pairs), np.concatenate(ends)
+
     def told(self) -> Told:
         """What was done, and how often what is interpolated is off."""
+        inside, difference = self.interpolated, self._said[: len(self._found)] - self._found
+        known = np.isfinite(difference)
+        there = difference[known]
+        off = int((~(np.abs(difference) <= self._settings.tolerance)).sum())
         count = 0 if self._checked is None else len(self._checked)
         share = low = high = None
-        there = self._difference[np.isfinite(self._difference)]
-        off = int((~(self._difference <= self._settings.tolerance)).sum())
         if count:
             interval = binomtest(off, count).proportion_ci(0.95, method="wilson")
             share, low, high = off / count, float(interval.low), float(interval.high)
         return Told(
-            self._settings.every,
-            self._settings.tolerance,
-            len(self._taken),
-            self._first,
-            int((self._taken & ~self._lost).sum()),
-            len(self.interpolated),
-            self._rounds,
-            count,
-            off,
-            float(there.mean()) if there.size else None,
-            float(there.max()) if there.size else None,
-            share,
-            low,
-            high,
+            every=self._settings.every,
+            tolerance=self._settings.tolerance,
+            places=len(self._taken),
+            first=self._first,
+            evaluated=int((self._taken & ~self._lost).sum()),
+            interpolated=len(inside),
+            alone=int(np.isfinite(self._estimate[inside]).sum()),
+            rounds=self._rounds,
+            checked=count,
+            off=off,
+            off_mean=float(np.abs(there).mean()) if there.size else None,
+            off_most=float(np.abs(there).max()) if there.size else None,
+            off_bias=float(there.mean()) if there.size else None,
+            off_of=float(self._found[known].mean()) if there.size else None,
+            off_share=share,
+            off_low=low,
+            off_high=high,
         )
 
     def _parts(self) -> Iterator[tuple[str, int, int]]:
@@ -203,7 +232,7 @@ class Coarse:
         for _, begin, count in self._parts():
             of_route = first_stations(count, half, every)
             stations.append(begin + of_route)
-            between.append(begin + probes(of_route, half, every))
+            between.append(begin + probes(of_route, every))
         return np.union1d(self._supports(np.concatenate(stations)), np.concatenate(between))
 
     def _supports(self, stations: Int64) -> Int64:
@@ -226,14 +255,12 @@ class Coarse:
         )
         count = min(self._settings.checks, -(-len(inside) // CHECKED_OF))
         self._checked = np.sort(inside[np.argsort(drawn[inside], kind="stable")[:count]])
+        there = np.flatnonzero(np.isfinite(self._estimate))
         if count:
-            ends = np.unique(self.gaps)
-            self._said = np.interp(self._checked, ends, self._estimate[ends])
+            self._said = np.interp(self._checked, there, self._estimate[there])
         return self._checked
 
     def _check(self) -> None:
-        """Compare the checked places, once they are evaluated."""
-        if self._checked is None or not self._said.size:
-            return
-        said, self._said = self._said, np.zeros(0)
-        self._difference = np.abs(said - self._estimate[self._checked])
+        """Keep what the checked places were evaluated to, once they are."""
+        if self._checked is not None and not self._found.size:
+            self._found = self._estimate[self._checked]

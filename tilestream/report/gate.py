@@ -41,8 +41,9 @@ class GateSettings(Settings):
         default=None,
         allow_inf_nan=True,  # so that the check below tells what to give
         description="Exit with 1 if any error, estimated or measured, is above this [m], if less "
-        f"than {EVALUATED:.0%} of a drive or of the places of a route were evaluated, or if more "
-        f"than {MISSING:.0%} of all places have no estimate.",
+        f"than {EVALUATED:.0%} of a drive was measured or of the places of a route have an "
+        f"estimate, or if more than {MISSING:.0%} of all have none; one that is interpolated "
+        "(--coarse) counts, and is told.",
     )
     measure: Measured = "mean"
     """Part of the error that --fail-over asks for; of p_fail it is a share."""

@@ -133,17 +133,18 @@ class Rounds:
 
     def between(self) -> dict[TileKey, Between]:
         """By tile, where its places are interpolated."""
-        gaps = self._coarse.gaps
+        ends, whole = self._coarse.between
         names, begins = list(self._routes), _begins(self._routes)
         found = {}
         for tile, numbers in self._numbers.items():
-            low, high = gaps[:, 0], gaps[:, 1]
-            last = np.searchsorted(low, numbers) - 1  # of those that begin before a place
-            inside = (last >= 0) & (numbers < np.append(high, -1)[last])
-            own = gaps[np.unique(last[inside])]
+            last = np.searchsorted(ends[:, 0], numbers) - 1  # of those that begin before a place
+            inside = (last >= 0) & (numbers <= np.append(ends[:, 1] - whole, -1)[last])
+            rows = np.unique(last[inside])
+            own = ends[rows]
             route = np.searchsorted(begins, own[:, 0], side="right") - 1
             route_ids = tuple(names[number] for number in route.tolist())
-            found[tile] = Between(route_ids, own - begins[route, None], self._values[own])
+            at = own - begins[route, None]
+            found[tile] = Between(route_ids, at, whole[rows], self._values[own])
         return found
 
     def remove_others(self) -> None:

@@ -18,10 +18,14 @@ from tilestream.report.segments import reaches, stretches
 
 WORSE = 0.02
 """Estimates that grew by more than this count as worse [m]."""
-PLACE = ("route_id", "arc_length", "x", "y", "before", "after", "change", "length", "why")
+PLACE = (
+    "route_id", "arc_length", "x", "y", "before", "after", "change", "length", "why",
+    "interpolated",
+)  # fmt: skip
 """The columns of a place that changed."""
 STRETCH = (
-    "route_id", "begin", "end", "length", "places", "at", "x", "y", "before", "after", "why",
+    "route_id", "begin", "end", "length", "places", "interpolated", "at", "x", "y", "before",
+    "after", "why",
 )  # fmt: skip
 """The columns of a stretch of road."""
 OTHERS = tuple(estimated_column(name) for name in MEASURES if name != "mean")
@@ -42,7 +46,8 @@ class Changes:
     places: pd.DataFrame
     """A row per place of the newer estimates, along each route: `route_id`, `sample`,
     `arc_length`, `x`, `y`, `z`, `before`, `after` [m; NaN: no estimate], `why` it got worse,
-    `reason` (as the newer table has it), and `OTHERS` and `ENDS` with `_before` and `_after`."""
+    `reason` (as the newer table has it), `interpolated_before` and `interpolated_after`: whether
+    the estimate was not evaluated, and `OTHERS` and `ENDS` with `_before` and `_after`."""
     left: pd.DataFrame
     """Places that had an estimate and that the newer ones come nowhere near: `route_id`,
     `arc_length`, `x`, `y`, `before`."""
@@ -73,6 +78,13 @@ class Changes:
             }
         return np.select(list(parts.values()), list(parts), "neither")
 
+    @cached_property
+    def interpolated(self) -> NDArray[np.bool_]:
+        """(n,) whether an estimate of a place, before or after, is interpolated."""
+        before, after = (self.places[f"interpolated_{when}"] for when in ("before", "after"))
+        found: NDArray[np.bool_] = before.to_numpy(np.bool_) | after.to_numpy(np.bool_)
+        return found
+
     def rows(self, kind: Kind) -> Int64:
         """The places that this became of, rising."""
         return np.flatnonzero(self.kind == kind)
@@ -100,8 +112,13 @@ class Changes:
         return int(np.isfinite(self.change).sum())
 
     @property
+    def compared_interpolated(self) -> int:
+        """Those of them with one that is interpolated."""
+        return int((self.interpolated & np.isfinite(self.change)).sum())
+
+    @property
     def length(self) -> float:
-        """Of road that they stand for [m]."""
+        """Of road that places with an estimate in both stand for [m]."""
         return float(self.reach[np.isfinite(self.change)].sum())
 
     @property
@@ -139,9 +156,9 @@ class Changes:
         return sorted(parts, key=lambda part: -float(np.nanmax(weight[part])))
 
     def stretches_of(self, kind: Kind) -> pd.DataFrame:
-        """The same as a table (`STRETCH`): `begin`, `end`, `length` [m], `places`, and of the place
-        with the largest change `at`, `x`, `y`, `before`, `after` [m] and `why`: of a lost estimate
-        the reason of the newer table.
+        """The same as a table (`STRETCH`): `begin`, `end`, `length` [m], `places`, how many of them
+        are `interpolated`, and of the place with the largest change `at`, `x`, `y`, `before`,
+        `after` [m] and `why`: of a lost estimate the reason of the newer table.
         """
         parts, weight = self.stretch_rows(kind), self._weight(kind)
         ends = self.places["arc_length"].to_numpy()
@@ -152,6 +169,7 @@ class Changes:
             end=[ends[part[-1]] for part in parts],
             length=[float(self.reach[part].sum()) for part in parts],
             places=[len(part) for part in parts],
+            interpolated=[int(self.interpolated[part].sum()) for part in parts],
             why=table["reason"] if kind == "lost" else table["why"],
         )
         return found[list(STRETCH)].reset_index(drop=True)
@@ -164,7 +182,9 @@ class Changes:
 
     def _changed(self, kind: Kind) -> pd.DataFrame:
         rows = self.rows(kind)
-        table = self.places.assign(change=self.change, length=self.reach).iloc[rows]
+        table = self.places.assign(
+            change=self.change, length=self.reach, interpolated=self.interpolated
+        ).iloc[rows]
         order = table.sort_values(
             ["change", "route_id", "arc_length"], ascending=[kind == "better", True, True]
         )

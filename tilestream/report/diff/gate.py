@@ -26,7 +26,8 @@ class DiffGateSettings(Settings):
         allow_inf_nan=True,  # so that the check below tells what to give
         description="Exit with 1 if any estimate grew by more than this [m], if less than "
         f"{EVALUATED:.0%} of the estimates of a route could be compared, if more than "
-        f"{MISSING:.0%} of all are lost, or if there are none.",
+        f"{MISSING:.0%} of all are lost, or if there are none; one that is interpolated "
+        "(--coarse) counts, and is told.",
     )
     measure: Measured = "mean"
     """Part of the error that --fail-worse asks for; of p_fail it is a share."""
@@ -89,7 +90,7 @@ def diff_gate(
     What is not compared does not pass: an update of which no place is compared, a route of which
     less than `EVALUATED` of the estimates of before are, and one by which more than `MISSING` of
     all estimates are lost or left behind. Estimates where there were none before are not judged,
-    which the verdict says.
+    and interpolated ones are as any other; the verdict says how many there are of both.
 
     Args:
         found: what is compared.
@@ -104,7 +105,7 @@ def diff_gate(
     before, after = found.places.estimates(measure)
     growth = after - before
     judged = found.places.places[["route_id", "arc_length"]].assign(
-        error=growth, measured=False, interpolated=False
+        error=growth, measured=False, interpolated=found.places.interpolated
     )
     judged = judged[np.isfinite(growth)]
     closed: list[str] = []
@@ -112,11 +113,14 @@ def diff_gate(
         judged = windows(judged)
     above = judged[judged["error"] > limit]
     if len(above):
+        between = int(above["interpolated"].sum())
+        told = f" ({between:,} of them interpolated)" if between else ""
         worst = above.iloc[int(np.argmax(above["error"]))]
         what = "sample points" if over == "places" else f"segments of {SEGMENT:g} m"
         closed.append(
             f"{measure}: {len(above):,} of {len(judged):,} {what} grew by more than "
-            f"{with_unit(limit, measure)}, the worst by {with_unit(worst['error'], measure)} on "
+            f"{with_unit(limit, measure)}{told}, the worst by "
+            f"{with_unit(worst['error'], measure)} on "
             f"{worst['route_id']} at {worst['arc_length']:.0f} m"
         )
     if not len(judged):
@@ -165,6 +169,12 @@ def _not_compared(places: Changes, growth: Float64) -> list[str]:
 def _besides(found: MapDiff) -> Sequence[str]:
     """What opens no gate and closes none."""
     told = []
+    if found.places.compared_interpolated:
+        told.append(
+            f"{found.places.compared_interpolated:,} of {found.places.compared:,} sample points "
+            "have an estimate, before or after, that is interpolated and was not evaluated: how "
+            "far off it may be, the report of its run says"
+        )
     if found.places.appeared:
         told.append(
             f"{found.places.appeared:,} sample points had no estimate before and are not judged: "

@@ -50,6 +50,10 @@ MARKERS = (
     ("worse", "triangle", "worse"),
     ("lost", "x", "lost"),
 )
+INTERPOLATED = ("interpolated_before", "interpolated_after")
+"""A mark is hollow and small where one of these holds …"""
+SMALLER = 0.6
+"""… by so much."""
 OUTLINES = {
     "changed": {"line_dash": "solid", "line_color": "#8560a8", "hatch_pattern": "/"},
     "added": {"line_dash": "dashed", "line_color": "#009e73", "hatch_pattern": "+"},
@@ -97,6 +101,7 @@ def diff_map(found: MapDiff, tip: str) -> dict[str, Any]:
             continue
         source = ColumnDataSource(_columns(rows, origin, found.digits), name=kind)
         style: dict[str, Any] = {"color": {"field": "step", "transform": mapper}, "size": "size"}
+        style["fill_alpha"] = "filled"
         if kind in ("lost", "left"):
             style |= {"line_width": 2.0}
         glyphs = plot.scatter("x", "y", source=source, marker=marker, legend_label=name, **style)
@@ -127,7 +132,7 @@ def _table(found: MapDiff) -> pd.DataFrame:
     """
     of = found.places
     places = of.places.assign(kind=of.kind, change=of.change)
-    left = of.left.assign(kind="left")
+    left = of.left.assign(kind="left", interpolated_before=False, interpolated_after=False)
     table = pd.concat([part for part in (places, left) if len(part)] or [places])
     gone = table["kind"].isin(["lost", "left", "appeared"])
     weight = table["change"].abs().astype(np.float64).fillna(0.0).mask(gone, np.inf)
@@ -149,13 +154,16 @@ def _columns(rows: pd.DataFrame, origin: Float64, digits: int | None) -> dict[st
         "after": FIXED.step(of("after")),
     }
     middle = len(SHADES) // 2
+    hollow = rows[list(INTERPOLATED)].to_numpy(bool).any(axis=1)
     size = np.where(change < 0, 9.0, 5.0 + 1.5 * np.abs(change - middle))
+    size = np.where(hollow, SMALLER * size, size)
     return {
         "x": of("x") - origin[0],
         "y": of("y") - origin[1],
         **{name: (step + 0.5).astype(np.float32) for name, step in steps.items()},
         "step": (steps["change"] + 0.5).astype(np.float32),
         "size": np.where(rows["kind"] == "neither", 5.0, size).astype(np.float32),
+        "filled": (~hollow).astype(np.float32),
         "weight": np.nan_to_num(of("weight"), posinf=1e9).astype(np.float32),
         "route": rows["route_id"].astype(str).tolist(),
         "arc": of("arc_length").astype(np.float32),
@@ -173,11 +181,12 @@ def _signed(change: float, digits: int | None) -> str:
 
 def _told(rows: pd.DataFrame, when: str, digits: int | None) -> list[str]:
     """The estimates in words, with their intervals where there are some."""
-    names = (when, f"low_{when}", f"high_{when}")
+    names = [when, f"low_{when}", f"high_{when}", f"interpolated_{when}"]
     found = []
-    for estimate, low, high in rows[list(names)].to_numpy(np.float64).tolist():
-        interval = f" ({cm_span(low, high, digits)})" if np.isfinite([low, high]).all() else ""
-        found.append(f"{cm_about(estimate, digits)}{interval}")
+    for estimate, low, high, between in rows[names].astype(np.float64).to_numpy().tolist():
+        how = f" ({cm_span(low, high, digits)})" if np.isfinite([low, high]).all() else ""
+        how = ", interpolated" if between else how
+        found.append(f"{cm_about(estimate, digits)}{how}")
     return found
 
 

@@ -69,6 +69,7 @@ def diff_page(found: MapDiff, content: Mapping[str, Any]) -> str:
         outlined=MOST_OUTLINES,
         shown=SHOWN,
         shown_every=places_shown_every(found),
+        hollow=bool(found.places.interpolated.any()),
     )
 
 

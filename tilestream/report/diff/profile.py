@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from bokeh.models import ColumnDataSource
 
 from tilestream.records import Float64, Int64
@@ -37,8 +38,8 @@ def diff_profile(found: MapDiff, route_id: str, target: str) -> dict[str, Any]:
         "arc": rows["arc_length"].to_numpy(np.float64),
         **{when: estimate * CM_PER_M for when, estimate in estimates.items()},
         "anchor": np.fmax(*estimates.values()) * CM_PER_M,
-        "was": [cm_about(error, found.digits) for error in estimates["before"]],
-        "is": [cm_about(error, found.digits) for error in estimates["after"]],
+        "was": _told(rows, "before", found.digits),
+        "is": _told(rows, "after", found.digits),
         **{axis: rows[axis].to_numpy(np.float64) for axis in "xy"},
     }
     for when, colour, _ in LINES:
@@ -58,6 +59,12 @@ def diff_profile(found: MapDiff, route_id: str, target: str) -> dict[str, Any]:
     finish(plot)
     plot.legend.ncols = 2
     return item(plot, target)
+
+
+def _told(rows: pd.DataFrame, when: str, digits: int | None) -> list[str]:
+    """The estimates in words."""
+    both = zip(rows[when], rows[f"interpolated_{when}"], strict=True)
+    return [f"{cm_about(e, digits)}{', interpolated' if between else ''}" for e, between in both]
 
 
 def _alone(estimate: Float64) -> Int64:

@@ -28,6 +28,7 @@ def diff_content(found: MapDiff, verdict: Verdict | None = None) -> dict[str, An
         "tilestream": VERSION,
         **tiles,
         "compared": places.compared,
+        "compared_interpolated": places.compared_interpolated,
         "compared_m": places.length,
         "limit": found.limit,
         "worse_m": places.length_of("worse"),
@@ -65,7 +66,12 @@ def _largest(places: Changes) -> float | None:
 
 def routes(places: Changes) -> list[dict[str, Any]]:
     """What became of each route, the one whose estimates grew most first."""
-    table = places.places.assign(change=places.change, length=places.reach, kind=places.kind)
+    table = places.places.assign(
+        change=places.change,
+        length=places.reach,
+        kind=places.kind,
+        interpolated=places.interpolated,
+    )
     found = []
     for name, part in table.groupby("route_id", sort=True):
         both = part[part["change"].notna()]
@@ -75,6 +81,7 @@ def routes(places: Changes) -> list[dict[str, Any]]:
                 "route_id": str(name),
                 "places": len(part),
                 "compared": len(both),
+                "compared_interpolated": int(both["interpolated"].sum()),
                 "compared_m": float(both["length"].sum()),
                 "worse": int(of_kind["worse"].sum()),
                 "better": int(of_kind["better"].sum()),
@@ -124,10 +131,12 @@ def diff_cards(content: Mapping[str, Any]) -> list[tuple[str, str]]:
             (thousands(removed), "tiles removed"),
         ]
     if content["compared"]:
+        between = content["compared_interpolated"]
         by, digits = f"by more than {cm(content['limit'], 0)}", content["digits"]
         growth = content["worst_growth"]
         cards += [
             (distance(content["compared_m"]), f"of road compared, {_points(content['compared'])}"),
+            *([(thousands(between), "of them interpolated before or after")] if between else []),
             (distance(content["worse_m"]), f"got worse {by}, {_points(len(content['worse']))}"),
             (distance(content["better_m"]), f"got better {by}, {_points(len(content['better']))}"),
             (f"{'+' if growth > 0.0 else ''}{cm_about(growth, digits)}", "the largest growth"),

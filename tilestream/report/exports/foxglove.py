@@ -11,7 +11,7 @@ from tilestream.files import Files
 from tilestream.formats.logs import Cloud, Marker, write_scene
 from tilestream.records import Float64, Int64
 from tilestream.report.colours import greys, height_range
-from tilestream.report.data import Findings, estimates
+from tilestream.report.data import Findings, estimates, interpolated
 from tilestream.report.exports.labels import worst_labels
 from tilestream.report.formatting import distance
 from tilestream.report.measured import measure_of
@@ -25,16 +25,17 @@ PARENT = "world"
 """The frame of the coordinates of the map, in which the scene's frame `map` is."""
 ROUND = 10.0
 """The origin is a multiple of this [m]."""
-ROUTE, WORST, CUBE, LETTERS = 0.6, 1.6, 0.9, 1.4
-"""Width of the route, diameter of one of the worst places, edge of a measured one, height of the
-letters [m]."""
+ROUTE, BETWEEN, WORST, CUBE, LETTERS = 0.6, 0.2, 1.6, 0.9, 1.4
+"""Width of the route, and of it where estimates are interpolated, diameter of one of the worst
+places, edge of a measured one, height of the letters [m]."""
 RAISED = 3.0
 """How far above its place a text stands [m]."""
 WHITE = np.full((1, 3), 255, np.uint8)
 ABOUT_TOPICS = (
     "map: the map, thinned, grey by height; places: every place with estimate, low, high, measured "
-    "[m] and p_fail [1]; route: the estimates as lines; worst: the worst places by number; "
-    "measured: cubes by the error that was measured there"
+    "[m], p_fail [1] and interpolated: 1 where it was not evaluated, else 0; route: the estimates "
+    "as lines, thin where interpolated; worst: the worst places by number; measured: cubes by the "
+    "error that was measured there"
 )
 
 
@@ -119,18 +120,26 @@ def _places(found: Findings, placed: NDArray[np.bool_], origin: Float64) -> Clou
     return Cloud(
         part[["x", "y", "z"]].to_numpy(np.float64) - origin,
         found.scale.rgb(estimates(part)),
-        values | {"measured": measure_of(part).measured},
+        values
+        | {"measured": measure_of(part).measured, "interpolated": interpolated(part).astype(float)},
     )
 
 
 def _route(found: Findings, at: Float64, placed: NDArray[np.bool_]) -> Iterator[Marker]:
-    """A line through each run of neighbours."""
+    """A line through each run of neighbours, thin and of a group of its own where they, or one of
+    two, are interpolated.
+    """
     rgb = found.scale.rgb(estimates(found.places))
     ids = found.places["route_id"].astype(str).to_numpy()
-    apart = ~(joined(found.places) & placed[1:] & placed[:-1])
-    for rows in np.split(np.arange(len(at)), np.flatnonzero(apart) + 1):
-        if len(rows) > 1:
-            yield Marker("line", ids[rows[0]], at[rows], rgb[rows], ROUTE)
+    there = joined(found.places) & placed[1:] & placed[:-1]
+    between = interpolated(found.places)
+    thin = between[1:] | between[:-1]  # the piece from each place to the next
+    for pieces in np.split(np.arange(len(there)), np.flatnonzero(np.diff(thin + 2 * there)) + 1):
+        if len(pieces) and there[pieces[0]]:
+            rows = np.append(pieces, pieces[-1] + 1)
+            name = f"{ids[rows[0]]}{', interpolated' if thin[pieces[0]] else ''}"
+            width = BETWEEN if thin[pieces[0]] else ROUTE
+            yield Marker("line", name, at[rows], rgb[rows], width)
 
 
 def _worst(found: Findings, at: Float64, labels: Mapping[int, str]) -> Iterator[Marker]:

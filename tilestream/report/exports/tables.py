@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 from tilestream.files import Files
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.report.columns import CATALOGUE
-from tilestream.report.data import Findings, estimates
+from tilestream.report.data import Findings, estimates, interpolated
 from tilestream.report.exports.geometry import crs_of, geojson, wkb_points
 from tilestream.report.segments import segments
 from tilestream.report.summary import plain
@@ -117,7 +117,8 @@ def write_geojson(
 
 def write_cloud(file: Files, found: Findings) -> int:
     """Write the sample points as PCD, coloured as on the map (`rgb` as PCL packs it), with their
-    `estimate` [m]; grey and NaN where there is none. A comment says what they are worth.
+    `estimate` [m]; grey and NaN where there is none; `interpolated` is 1 where that was not
+    evaluated, else 0. A comment says what they are worth.
 
     Returns:
         How many places have no position and are not in it.
@@ -130,6 +131,7 @@ def write_cloud(file: Files, found: Findings) -> int:
     fields = {
         "rgb": packed.view(np.float32),
         "estimate": estimate[placed].astype(np.float32),
+        "interpolated": interpolated(found.places)[placed].astype(np.uint8),
     }
     write_pcd(
         file.address, at[placed], fields=fields, comments=[found.worth_told] if found.worth else []
