@@ -168,7 +168,7 @@ def errors(city: City, folder: Path, preset: str, path: Path) -> None:
 
 def main(given: argparse.Namespace) -> None:
     """Draw everything."""
-    city = build_city(load_preset(given.preset), check=False)
+    city = build_city(load_preset(given.preset))
     given.figures.mkdir(parents=True, exist_ok=True)
     if given.labels is not None:
         errors(city, given.labels, given.preset, given.figures / "simulation_errors.png")

@@ -40,7 +40,7 @@ CASTERS: dict[str, type[Embree | Open3D]] = {"embreex": Embree, "Open3D": Open3D
 def main(given: argparse.Namespace) -> None:
     """Build, cast, compare, print."""
     settings = load_preset(given.preset)
-    city = build_city(settings, check=False)
+    city = build_city(settings)
     street = city.street(given.path)
     xy = street.xy[given.point : given.point + given.metres]
     origin = np.array([*xy[0], 0.0])

@@ -193,7 +193,7 @@ def knobs_of_the_drive(settings: SimulationSettings, given: argparse.Namespace) 
         simulate(settings, given.out, paths=given.paths, size=given.size, client=client)
         survey = str(given.out / "survey" / "*.laz")
         store = ts.ingest(survey, given.out / "map.zarr", client=client)
-    city = build_city(settings, check=False)
+    city = build_city(settings)
     places = [
         (street, point)
         for street in city.streets

@@ -35,7 +35,7 @@ from tilestream.simulation.survey import survey
 def main(given: argparse.Namespace) -> None:
     """Time the parts of one stretch of street; the least of three runs each."""
     began = time.perf_counter()
-    city = build_city(load_preset(given.preset), check=False)
+    city = build_city(load_preset(given.preset))
     print(f"city: {time.perf_counter() - began:.1f} s, {len(city.footprints.height)} buildings")
     street, span = city.street(given.path), (given.point, given.point + given.metres)
     seconds: dict[str, list[float]] = {"scene": [], "scans": [], "survey": []}

@@ -13,11 +13,11 @@ LEVEL = 0.9
 """Share of the resampled figures that an interval holds."""
 
 
-def resampled(blocks: int, seed: int = 0) -> Float64:
+def resampled(blocks: int) -> Float64:
     """(TIMES, blocks) how often each block is drawn, when as many are drawn with replacement as
-    there are.
+    there are; always the same.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     return rng.multinomial(blocks, np.full(blocks, 1.0 / blocks), TIMES).astype(np.float64)
 
 

@@ -110,13 +110,9 @@ def calibrate(
 
 
 def stretch(
-    interval: Interval,
-    actual: Float64,
-    estimate: Float64,
-    block: NDArray[np.str_],
-    level: float = LEVEL,
+    interval: Interval, actual: Float64, estimate: Float64, block: NDArray[np.str_]
 ) -> float:
-    """How many times longer an interval has to be to hold a share of the places of some blocks.
+    """How many times longer an interval has to be to hold `LEVEL` of the places of some blocks.
 
     As in `calibrate` every block weighs the same, the hardest twice, and few blocks ask for more.
 
@@ -125,15 +121,14 @@ def stretch(
         actual: (n,) labels.
         estimate: (n,) their estimates.
         block: (n,) names of the blocks.
-        level: share of the places to hold.
     """
     names, index = np.unique(block, return_inverse=True)
     miss = (actual - estimate) / (interval.constant + estimate)
     score = np.maximum(miss / interval.above, -miss / interval.below)
-    return _of_blocks(score, index, level) * wider_for_few(len(names), level)
+    return _of_blocks(score, index, LEVEL) * wider_for_few(len(names))
 
 
-def interval_score(actual: Float64, low: Float64, high: Float64, level: float = LEVEL) -> Float64:
+def interval_score(actual: Float64, low: Float64, high: Float64, level: float) -> Float64:
     """(n,) width of each interval and a fine for a miss: 2 / (1 - level) times how far it is off.
 
     Least in the mean where the ends are the true quantiles (Gneiting and Raftery 2007, eq. 43).

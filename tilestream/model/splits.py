@@ -56,8 +56,8 @@ def random_split(dataset: Dataset, seed: int = 0) -> list[Split]:
     return [Split("random quarter", np.sort(order[:cut]), np.sort(order[cut:]))]
 
 
-def leave_path_out(dataset: Dataset, buffer: float = BUFFER) -> list[Split]:
-    """Each path is estimated from the others, without their points within `buffer` [m] of it.
+def leave_path_out(dataset: Dataset) -> list[Split]:
+    """Each path is estimated from the others, without their points within `BUFFER` of it.
 
     Raises:
         ModelError: a single path, or too few points left to train.
@@ -66,11 +66,11 @@ def leave_path_out(dataset: Dataset, buffer: float = BUFFER) -> list[Split]:
     names = np.unique(paths)
     if len(names) < 2:
         raise ModelError(f"one path only ({names[0]}): leaving it out leaves nothing to train on")
-    return [_held_out(dataset, f"path {name}", paths == name, buffer) for name in names]
+    return [_held_out(dataset, f"path {name}", paths == name) for name in names]
 
 
-def block_splits(dataset: Dataset, folds: int = FOLDS, buffer: float = BUFFER) -> list[Split]:
-    """The blocks are dealt in turn into folds; each fold is estimated from points beyond `buffer`.
+def block_splits(dataset: Dataset, folds: int = FOLDS) -> list[Split]:
+    """The blocks are dealt in turn into folds; each fold is estimated from points beyond `BUFFER`.
 
     Raises:
         ModelError: a single block, or too few points left to train.
@@ -79,7 +79,7 @@ def block_splits(dataset: Dataset, folds: int = FOLDS, buffer: float = BUFFER) -
     names = np.unique(blocks)
     if len(names) < 2:
         raise ModelError(f"one block only ({names[0]}): the drive is too short to be divided")
-    return _dealt(dataset, blocks, folds, buffer)
+    return _dealt(dataset, blocks, folds)
 
 
 def nested_splits(dataset: Dataset, folds: int) -> list[Split]:
@@ -92,7 +92,7 @@ def nested_splits(dataset: Dataset, folds: int) -> list[Split]:
     paths = dataset.streets
     if len(np.unique(paths)) < 3:
         return block_splits(dataset, folds)
-    return _dealt(dataset, paths, folds, BUFFER)
+    return _dealt(dataset, paths, folds)
 
 
 def leave_lidar_out(dataset: Dataset) -> list[Split]:
@@ -111,7 +111,7 @@ def leave_lidar_out(dataset: Dataset) -> list[Split]:
         for k in range(folds):
             test = own & (streets % folds == k)
             if test.any():
-                found.append(_held_out(dataset, f"{lidar}, fold {k}", test, BUFFER, ~own))
+                found.append(_held_out(dataset, f"{lidar}, fold {k}", test, ~own))
     return found
 
 
@@ -123,8 +123,7 @@ def leave_district_out(dataset: Dataset) -> list[Split]:
     """
     districts = _of_several(dataset, "district")
     return [
-        _held_out(dataset, f"district {name}", districts == name, BUFFER)
-        for name in np.unique(districts)
+        _held_out(dataset, f"district {name}", districts == name) for name in np.unique(districts)
     ]
 
 
@@ -140,22 +139,21 @@ def _of_several(dataset: Dataset, name: str) -> NDArray[np.str_]:
     return there
 
 
-def _dealt(dataset: Dataset, units: NDArray[np.str_], folds: int, buffer: float) -> list[Split]:
+def _dealt(dataset: Dataset, units: NDArray[np.str_], folds: int) -> list[Split]:
     """Units, by (n,) names, dealt in turn into folds."""
     names = np.unique(units)
     folds = min(folds, len(names))
     fold = np.searchsorted(names, units) % folds
-    return [_held_out(dataset, f"fold {k}", fold == k, buffer) for k in range(folds)]
+    return [_held_out(dataset, f"fold {k}", fold == k) for k in range(folds)]
 
 
 def _held_out(
     dataset: Dataset,
     name: str,
     test: NDArray[np.bool_],
-    buffer: float,
     may_train: NDArray[np.bool_] | None = None,
 ) -> Split:
-    """A split; of what is not held out, what may train and lies beyond `buffer` in its district."""
+    """A split; of what is not held out, what may train and lies beyond `BUFFER` in its district."""
     at = dataset.rows[["x", "y"]].to_numpy(np.float64)
     at = at - at[0]
     if dataset.makings:  # each district has a frame of its own
@@ -163,10 +161,10 @@ def _held_out(
         at = np.column_stack([at, APART * district])
     distance, _ = cKDTree(at[test]).query(at)
     there = ~test if may_train is None else ~test & may_train
-    train = np.flatnonzero(there & (distance > buffer))
+    train = np.flatnonzero(there & (distance > BUFFER))
     if len(train) < TRAIN_MIN:
         raise ModelError(
-            f"{name}: {len(train)} points lie beyond {buffer:g} m of it, too few to train on: "
+            f"{name}: {len(train)} points lie beyond {BUFFER:g} m of it, too few to train on: "
             "drive more, or farther apart"
         )
     return Split(name, train, np.flatnonzero(test))

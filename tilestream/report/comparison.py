@@ -66,9 +66,10 @@ class Comparison:
         if len(set(self.rows.groupby("choice").size())) > 1:
             raise UsageError("rows: give every choice the same sample points")
 
-    def by_choice(self, column: str) -> pd.DataFrame:
-        """A column of the rows as a table: a row per sample point, a column per choice."""
-        return _by_choice(self.rows, column)[self.choices["choice"].tolist()]
+    @property
+    def estimates(self) -> pd.DataFrame:
+        """The estimates [m] as a table: a row per sample point, a column per choice."""
+        return _by_choice(self.rows)[self.choices["choice"].tolist()]
 
     def summaries(self, threshold: float) -> list[dict[str, Any]]:
         """The figures of each choice.
@@ -86,7 +87,7 @@ class Comparison:
             UsageError: a threshold that is no positive length.
         """
         check_threshold(threshold)
-        known = self.by_choice("vd_mean").notna()
+        known = self.estimates.notna()
         any_knows = known.any(axis=1)
         size = self.cells.groupby("cell_size")["cells"].sum()
         found = []
@@ -108,20 +109,20 @@ class Comparison:
             found.append(dict(choice) | figures)
         return [dict(plain(figures)) for figures in found]
 
-    def differing(self, count: int = 10) -> list[dict[str, Any]]:
+    def differing(self) -> list[dict[str, Any]]:
         """Where the choices differ most, no two places near one another (`segments.APART`).
 
         Returns:
             The largest difference first: place, `best` and `worst` (of the choices that have an
             estimate there), their estimates and the difference [m]; no place where they agree.
         """
-        estimate = self.by_choice("vd_mean")
+        estimate = self.estimates
         first = self.rows[self.rows["choice"] == self.choices["choice"].iloc[0]]
         places = first.set_index(["route_id", "sample"]).loc[estimate.index].reset_index()
         spread = (estimate.max(axis=1) - estimate.min(axis=1)).to_numpy(np.float64)
         places["estimate"] = np.where(spread > 0.0, spread, np.nan)
         found = []
-        for row in worst_places(places, count):
+        for row in worst_places(places):
             place, here = places.iloc[row], estimate.iloc[row]
             found.append(
                 {name: place[name] for name in ("route_id", "arc_length", "x", "y", "z")}
@@ -192,7 +193,7 @@ class Comparison:
                     "tilestream": VERSION,
                     "threshold": threshold,
                     "cap": cap,
-                    "places": len(self.by_choice("vd_mean")),
+                    "places": len(self.estimates),
                     "worth": {"warnings": [], "told": self.worth},
                     "routes": list(dict.fromkeys(self.rows["route_id"])),
                     "choices": self.summaries(threshold),
@@ -219,7 +220,7 @@ def _judged(rows: pd.DataFrame | None, sizes: dict[float, str], cap: float) -> _
     """What the estimates of a tile (None: it has no sample points) say of each size."""
     if rows is None:
         return _Judged(0, {}, [])
-    estimate = _by_choice(rows, "vd_mean")
+    estimate = _by_choice(rows)
     estimated = estimate[estimate.notna().any(axis=1)]
     if estimated.empty:
         return _Judged(len(estimate), {}, [])
@@ -253,7 +254,7 @@ def _costs(
     rows: pd.DataFrame, sizes: dict[float, str], cells: pd.DataFrame, judged: Iterable[_Judged]
 ) -> list[dict[str, Any]]:
     """What each cell size costs: in cells, and in error against the baseline, the first."""
-    estimate = _by_choice(rows, "vd_mean")
+    estimate = _by_choice(rows)
     baseline = estimate[next(iter(sizes.values()))]
     suffices = Counter(size for one in judged for size in one.enough)
     found = []
@@ -273,7 +274,7 @@ def _costs(
     return found
 
 
-def _by_choice(rows: pd.DataFrame, column: str) -> pd.DataFrame:
-    """A row per sample point, a column per choice, also of choices without any figure."""
+def _by_choice(rows: pd.DataFrame) -> pd.DataFrame:
+    """Estimates: a row per sample point, a column per choice, also of choices without any."""
     keys = ["route_id", "sample", "choice"]
-    return rows.set_index(keys)[column].unstack()  # noqa: PD010 - a pivot_table drops those
+    return rows.set_index(keys)["vd_mean"].unstack()  # noqa: PD010 - a pivot_table drops those

@@ -38,12 +38,12 @@ HEIGHTS, NOTHING = "viridis", "#15181d"
 PATHS_ON_A_FIGURE = 12
 
 
-def png(figure: Figure, dpi: int = 110) -> bytes:
+def png(figure: Figure) -> bytes:
     """A figure as PNG; the same figure gives the same bytes."""
     FigureCanvasAgg(figure)
     buffer = io.BytesIO()
     figure.savefig(
-        buffer, format="png", dpi=dpi, metadata={"Software": None}, pil_kwargs={"optimize": True}
+        buffer, format="png", dpi=110, metadata={"Software": None}, pil_kwargs={"optimize": True}
     )
     return buffer.getvalue()
 
@@ -83,9 +83,9 @@ def surroundings(points: Float64, place: Float64, heading: float, seen: Float64)
     return figure
 
 
-def heights_ramp(steps: int = 9) -> list[str]:
+def heights_ramp() -> list[str]:
     """The colours of the heights from `BELOW` to `ABOVE`, for a legend."""
-    return [mpl.colors.to_hex(c) for c in mpl.colormaps[HEIGHTS](np.linspace(0.0, 1.0, steps))]
+    return [mpl.colors.to_hex(c) for c in mpl.colormaps[HEIGHTS](np.linspace(0.0, 1.0, 9))]
 
 
 def _seen_from_above(offset: Float64) -> Float64:

@@ -80,32 +80,32 @@ def stretches(places: pd.DataFrame, over: Int64) -> list[Int64]:
     return [np.arange(part[0], part[-1] + 1) for part in parts if part.size]
 
 
-def worst_places(places: pd.DataFrame, count: int = WORST, apart: float = APART) -> list[int]:
-    """Rows of the highest errors, estimated or measured there, the highest first, no two nearer
-    than `apart` [m].
+def worst_places(places: pd.DataFrame) -> list[int]:
+    """Rows of the `WORST` highest errors, estimated or measured there, the highest first, no two
+    nearer than `APART`.
 
     Distance is straight through the map, so two routes over one spot name it once.
     """
     at = places[["x", "y", "z"]].to_numpy(np.float64)
-    return _apart(measure_of(places).known, np.where(np.isfinite(at), at, 0.0), count, apart)
+    return _apart(measure_of(places).known, np.where(np.isfinite(at), at, 0.0), WORST)
 
 
-def worst_measured(labels: pd.DataFrame, count: int = MEASURED, apart: float = APART) -> list[int]:
-    """Rows of the largest measured errors, the largest first, no two of a path nearer than `apart`
-    [m] along it.
+def worst_measured(labels: pd.DataFrame) -> list[int]:
+    """Rows of the `MEASURED` largest measured errors, the largest first, no two of a path nearer
+    than `APART` along it.
     """
     paths, _ = pd.factorize(labels["path"])
     along = labels["arc_length"].to_numpy(np.float64)
-    at = np.column_stack([along, paths * 2.0 * (np.ptp(along) + apart)])
-    return _apart(labels["error_mean"].to_numpy(np.float64), at, count, apart)
+    at = np.column_stack([along, paths * 2.0 * (np.ptp(along) + APART)])
+    return _apart(labels["error_mean"].to_numpy(np.float64), at, MEASURED)
 
 
-def _apart(error: Float64, at: Float64, count: int, apart: float) -> list[int]:
-    """Rows of the largest errors that are known, no two of them nearer than `apart` [m]."""
+def _apart(error: Float64, at: Float64, count: int) -> list[int]:
+    """Rows of the largest errors that are known, no two of them nearer than `APART`."""
     chosen: list[int] = []
     for row in np.argsort(-error, kind="stable").tolist():
         if len(chosen) == count or np.isnan(error[row]):
             break
-        if all(math.dist(at[row], at[other]) >= apart for other in chosen):
+        if all(math.dist(at[row], at[other]) >= APART for other in chosen):
             chosen.append(row)
     return chosen

@@ -20,7 +20,6 @@ from tilestream.simulation.mesh import Mesh, joined
 from tilestream.simulation.settings import SimulationSettings
 from tilestream.simulation.streets import (
     Street,
-    check_clear,
     free_space,
     read_streets,
     street_called,
@@ -72,16 +71,15 @@ class City:
         )
 
 
-def build_city(settings: SimulationSettings, check: bool = True) -> City:
+def build_city(settings: SimulationSettings) -> City:
     """Read footprints and routes and furnish the streets.
 
     Args:
-        settings: of the experiment.
-        check: whether routes are tested against the buildings.
+        settings: of the experiment; whether a route is clear of buildings is not looked at
+            (`check_clear`).
 
     Raises:
         SourceError: footprints or routes that cannot be read.
-        UsageError: a route that comes too near to a building.
     """
     streets = read_streets(data_file(settings.city.routes))
     everything = np.concatenate([street.xy for street in streets])
@@ -89,9 +87,6 @@ def build_city(settings: SimulationSettings, check: bool = True) -> City:
     footprints = read_footprints(data_file(settings.city.footprints)).within(
         tuple(low), tuple(high)
     )
-    if check:
-        for street in streets:
-            check_clear(street, footprints)
     ground = Ground.of(free_space(footprints), streets, settings)
     return City(settings, footprints, streets, ground, furniture.placed(streets, ground, settings))
 

@@ -75,7 +75,7 @@ def walls(start: Float64, end: Float64, low: Float64, high: Float64, material: i
     )
 
 
-def boxes(centre: Float64, size: Float64, yaw: Float64, material: int, floor: bool = True) -> Mesh:
+def boxes(centre: Float64, size: Float64, yaw: Float64, material: int) -> Mesh:
     """Upright boxes.
 
     Args:
@@ -83,7 +83,6 @@ def boxes(centre: Float64, size: Float64, yaw: Float64, material: int, floor: bo
         size: (n, 3) length along its heading, width, height [m].
         yaw: (n,) heading [rad].
         material: of all of them.
-        floor: whether the base is closed.
     """
     signs = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) / 2
     local = signs[None] * size[:, None, :2]
@@ -101,25 +100,21 @@ def boxes(centre: Float64, size: Float64, yaw: Float64, material: int, floor: bo
         quads(base[:, i], base[:, j], top[:, j], top[:, i], material)
         for i, j in ((0, 1), (1, 2), (2, 3), (3, 0))
     ]
-    lids = [top, base] if floor else [top]
-    return joined([*sides, *(_lid(lid, material) for lid in lids)])
+    lids = (quads(r[:, 0], r[:, 1], r[:, 2], r[:, 3], material) for r in (top, base))
+    return joined([*sides, *lids])
 
 
-def _lid(ring: Float64, material: int) -> Mesh:
-    return quads(ring[:, 0], ring[:, 1], ring[:, 2], ring[:, 3], material)
-
-
-def posts(foot: Float64, radius: Float64, height: Float64, material: int, sides: int = 6) -> Mesh:
-    """Upright prisms of a regular polygon, open at both ends: posts, trunks, bollards."""
-    angle = np.arange(sides + 1) * 2 * np.pi / sides
+def posts(foot: Float64, radius: Float64, height: Float64, material: int) -> Mesh:
+    """Upright prisms of a regular hexagon, open at both ends: posts, trunks, bollards."""
+    angle = np.arange(7) * 2 * np.pi / 6
     ring = np.column_stack([np.cos(angle), np.sin(angle)])
     xy = foot[:, None, :2] + radius[:, None, None] * ring
-    low = np.repeat(foot[:, 2], sides)
+    low = np.repeat(foot[:, 2], 6)
     return walls(
         xy[:, :-1].reshape(-1, 2),
         xy[:, 1:].reshape(-1, 2),
         low,
-        low + np.repeat(height, sides),
+        low + np.repeat(height, 6),
         material,
     )
 

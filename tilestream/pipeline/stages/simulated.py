@@ -55,7 +55,7 @@ class SimulatedCity:
 
 @lru_cache(maxsize=1)
 def _city(settings: str) -> City:
-    return build_city(SimulationSettings.model_validate_json(settings), check=False)
+    return build_city(SimulationSettings.model_validate_json(settings))
 
 
 @dataclass(frozen=True)
