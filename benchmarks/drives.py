@@ -56,7 +56,8 @@ import tilestream as ts
 from tilestream.errors import PartialError
 from tilestream.model.dataset import Dataset
 from tilestream.model.file import load_model
-from tilestream.model.training import Model, predict
+from tilestream.model.prediction import predict
+from tilestream.model.training import Model
 from tilestream.pipeline.jobs.run import dataset_of
 from tilestream.pipeline.jobs.train_over import as_read
 

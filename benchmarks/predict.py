@@ -51,8 +51,9 @@ from model_data import LENGTHS, dataset, with_virtual_drives
 from tilestream.files import Files
 from tilestream.grid import TileKey
 from tilestream.model.file import load_model, save_model
+from tilestream.model.prediction import predict
 from tilestream.model.registry import REGRESSORS
-from tilestream.model.training import predict, train
+from tilestream.model.training import train
 from tilestream.pipeline.engine.attempt import perform
 from tilestream.pipeline.engine.outputs import Parquet
 from tilestream.pipeline.engine.stage import Product, Task

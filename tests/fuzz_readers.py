@@ -35,7 +35,8 @@ from tilestream.marks import Mark
 from tilestream.matcher import RegistrationSettings
 from tilestream.model.file import load_model, save_model
 from tilestream.model.forest import Growth, PaperForest
-from tilestream.model.training import predict, train
+from tilestream.model.prediction import predict
+from tilestream.model.training import train
 from tilestream.pipeline.jobs.inventory import Entry, inventory_of, write_inventory
 from tilestream.pipeline.jobs.run_names import INVENTORY
 from tilestream.pipeline.jobs.run_settings import read_settings

@@ -42,7 +42,8 @@ from tilestream.model.dataset import TARGETS
 from tilestream.model.file import load_model, save_model
 from tilestream.model.forest import Growth, PaperForest
 from tilestream.model.intervals import coverage
-from tilestream.model.training import PREDICTION_COLUMNS, predict
+from tilestream.model.prediction import predict
+from tilestream.model.training import PREDICTION_COLUMNS
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.cluster import dask_client
 from tilestream.pipeline.engine.costs import calibration_file, core_hours, learn

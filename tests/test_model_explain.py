@@ -12,7 +12,8 @@ from tilestream.model.explain import SHARES, UNITS, Typical, compared, in_words,
 from tilestream.model.features import features_of
 from tilestream.model.forest import Growth, TunedForest
 from tilestream.model.phrases import PHRASES, REASSURING, phrase_of
-from tilestream.model.training import predict, train
+from tilestream.model.prediction import predict
+from tilestream.model.training import train
 from tilestream.pipeline.stages.predict import physical
 from tilestream.pipeline.stages.samples import COLUMNS as COLUMNS_LEARNT
 from tilestream.records import Column

@@ -27,7 +27,8 @@ from tilestream.model.dataset import TARGETS, Dataset, made_with
 from tilestream.model.domain import domain_of
 from tilestream.model.file import load_model, save_model
 from tilestream.model.forest import Growth, PaperForest
-from tilestream.model.training import PREDICTION_COLUMNS, Model, predict, train
+from tilestream.model.prediction import predict
+from tilestream.model.training import PREDICTION_COLUMNS, Model, train
 from tilestream.sensor import HDL64, VLP16
 
 MADE_WITH = made_with(COLUMNS, VLP16, 2.0)

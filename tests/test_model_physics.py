@@ -16,8 +16,9 @@ from tilestream.model.corrected import WEIGHTS, Corrected
 from tilestream.model.dataset import TARGETS, Dataset
 from tilestream.model.evaluation import held_out
 from tilestream.model.physics import VIRTUAL, Physics, possible, width_of
+from tilestream.model.prediction import predict
 from tilestream.model.splits import leave_path_out
-from tilestream.model.training import ESTIMATES, predict, train
+from tilestream.model.training import ESTIMATES, train
 
 LENGTHS = {"a": 210, "b": 210, "c": 210}
 

@@ -12,6 +12,7 @@ import pytest
 import tilestream as ts
 from tilestream.errors import ModelError, UsageError
 from tilestream.matcher import MATCHERS
+from tilestream.model.applicability import check_making
 from tilestream.model.card import card_told
 from tilestream.model.checked import checked_of
 from tilestream.model.dataset import Dataset, made_with
@@ -21,8 +22,9 @@ from tilestream.model.figures import figures_of
 from tilestream.model.file import load_model, save_model
 from tilestream.model.making import inputs_of
 from tilestream.model.over_runs import Run, over_runs
+from tilestream.model.prediction import predict
 from tilestream.model.splits import BUFFER, OVER_RUNS, PROTOCOLS, leave_path_out, protocols_of
-from tilestream.model.training import check_making, predict, train
+from tilestream.model.training import train
 from tilestream.pipeline.jobs.train_over import as_read
 from tilestream.sensor import Sensor
 

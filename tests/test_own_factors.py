@@ -17,8 +17,10 @@ from tilestream.factors import own as owns
 from tilestream.factors.own import OwnFactors, columns_in, own_factors, own_table
 from tilestream.factors.rows import samples_by_tile
 from tilestream.formats.points.pcd import write_pcd
+from tilestream.model.applicability import check_making
 from tilestream.model.file import load_model, save_model
-from tilestream.model.training import check_making, predict, train
+from tilestream.model.prediction import predict
+from tilestream.model.training import train
 from tilestream.pipeline.engine.executor import execute
 from tilestream.pipeline.engine.outputs import Made, Stored
 from tilestream.pipeline.jobs.along_routes import plan_factors

@@ -3,7 +3,7 @@
 ```
 factors --+            splits (what is held out) --> evaluation (Table IV, opponents)
           +--> join --> dataset --+--> registry: physics, corrected, forest, baselines
-errors  --+                       +--> intervals, domain, explain --> training --> file
+errors  --+                       +--> intervals, domain, explain --> training --> file, prediction
                                   +--> figures, bootstrap, repeats: how good, and how sure that is
 ```
 

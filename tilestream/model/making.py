@@ -6,8 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from tilestream.errors import ModelError
-from tilestream.factors.own import OWN
 from tilestream.sensor import Carrier, rim_of, sensor_of
 
 MAY_DIFFER = ("sensor", "sensor_height", "matcher")
@@ -132,9 +130,8 @@ def outside(ranges: Mapping[str, Sequence[Value]], making: Mapping[str, Any]) ->
         if isinstance(value, str):
             inside = value in known
         else:
-            slack = 1e-9 * max(
-                1.0, abs(value)
-            )  # a range read from JSON is exact, a tilt may not be
+            # a range read from JSON is exact, a tilt may not be
+            slack = 1e-9 * max(1.0, abs(value))
             inside = bool(numbers) and numbers[0] - slack <= value <= numbers[-1] + slack
         if not inside:
             found.append(Outside(name, value, range_told(known)))
@@ -147,23 +144,6 @@ def range_told(known: Sequence[Value]) -> str:
     words = [one for one in known if isinstance(one, str)]
     told = " to ".join(dict.fromkeys(numbers))
     return ", ".join([*([told] if told else []), *words]) or "nothing of it"
-
-
-def check_own(trained: Mapping[str, Any], given: Mapping[str, Any], factors: Sequence[str]) -> None:
-    """Refuse a making without the factors of the user's own that a model learnt from, or with
-    others of their names.
-
-    Raises:
-        ModelError: names the factor.
-    """
-    there = given.get(OWN, {})
-    for name, source in trained.get(OWN, {}).items():
-        if name in factors and there.get(name) != source:
-            why = "is another one now" if name in there else "is not among those of the job"
-            raise ModelError(
-                f"the model learnt from the factor {name} of a file of its own, which {why}: name "
-                "that file under factors, or train a model"
-            )
 
 
 def _told(value: Value) -> str:

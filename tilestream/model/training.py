@@ -1,4 +1,4 @@
-"""A model for every place: train it on a dataset, apply it to a table of factors."""
+"""A model for every place: what it is, and how it is trained on a dataset."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -6,19 +6,15 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import pandas as pd
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from tilestream.errors import ModelError, UsageError
-from tilestream.factors.own import OWN
 from tilestream.model.card import JUDGED, card_of
 from tilestream.model.covariance import Calibration
 from tilestream.model.covariance_training import calibration_of
-from tilestream.model.dataset import TARGETS, Dataset, matrix
+from tilestream.model.dataset import TARGETS, Dataset
 from tilestream.model.domain import WIDEST, Domain, domain_of
-from tilestream.model.explain import PIECE, Typical, compared, in_words, typical_of
-from tilestream.model.features import with_derived
+from tilestream.model.explain import PIECE, Typical, typical_of
 from tilestream.model.intervals import (
     LEVEL,
     NOT_CALIBRATED,
@@ -27,12 +23,11 @@ from tilestream.model.intervals import (
     stretch,
     wider_for_few,
 )
-from tilestream.model.making import Outside, check_own, outside, shared
 from tilestream.model.physics import Physics, width_of
 from tilestream.model.registry import DEFAULT, OF_VIRTUAL_DRIVES, REGRESSORS
 from tilestream.model.regressor import Regressor, held_out_estimates
 from tilestream.model.splits import block_splits, leave_lidar_out
-from tilestream.records import Column, Float64
+from tilestream.records import Column
 
 MAIN = "error_mean"
 ESTIMATES = {
@@ -94,7 +89,7 @@ PREDICTION_COLUMNS = (
         dtype="str",
     ),
 )
-"""What `predict` adds to a place."""
+"""What a model says of a place (`prediction.predict`)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,177 +235,3 @@ def _wider_outside(dataset: Dataset, interval: Interval) -> float:
     estimate = held_out_estimates(dataset, splits, partial(Physics.fit, target=MAIN))
     lidars = dataset.rows["lidar"].to_numpy(str)
     return float(np.clip(stretch(interval, dataset.label(MAIN), estimate, lidars), 1.0, WIDEST))
-
-
-def predict(
-    model: Model, factors: pd.DataFrame, made_with: Mapping[str, Any] | None = None
-) -> pd.DataFrame:
-    """Estimate the error of places; each row for itself, the same bits in any company and order.
-
-    A row with a NaN among its factors has NaN estimates, status `missing` and a reason that names
-    the factor; nothing is imputed. Count them by `status`.
-
-    Args:
-        model: a trained or loaded model.
-        factors: a table with the model's factors; `heading` too where factors in map axes
-            are turned into the route's (`dataset.IN_MAP_AXES`). Other factors of the dataset that
-            the model was trained on (`model.typical`) serve the reasons, as far as they are there.
-        made_with: what these factors were computed with; compared with the model's
-            (`check_making`). None: the caller vouches for it.
-
-    Returns:
-        `PREDICTION_COLUMNS` on the index of `factors`; targets without labels are NaN.
-
-    Raises:
-        ModelError: a factor that the table lacks or that is no number, or factors of another
-            making; says which.
-    """
-    strange = [] if made_with is None else check_making(model, made_with)
-    table = with_derived(factors)
-    X = _matrix(model, table)
-    good = np.asarray(np.isfinite(X).all(axis=1))
-    out = {c.name: np.full(len(X), np.nan) for c in PREDICTION_COLUMNS if c.dtype == "float64"}
-    if good.any():
-        places = pd.DataFrame(X[good], columns=list(model.factors))
-        for target, regressor in model.regressors.items():
-            out[ESTIMATES[target]][good] = regressor.predict(places)
-        out["domain_distance"][good] = model.domain.distance(X[good])
-    widen = model.domain.widen(out["domain_distance"]) * (model.wider_outside if strange else 1.0)
-    out["low"], out["high"] = model.interval.around(out["estimate"], widen)
-    in_domain = good & (out["domain_distance"] <= model.domain.threshold) & (not strange)
-    columns: dict[str, Any] = {
-        **out,
-        "in_domain": in_domain,
-        "status": np.where(good, "done", "missing").astype(object),
-        "reason": _reasons(model, table, X, out, good, strange),
-    }
-    return pd.DataFrame({c.name: columns[c.name] for c in PREDICTION_COLUMNS}, index=factors.index)
-
-
-def _matrix(model: Model, table: pd.DataFrame) -> Float64:
-    absent = [name for name in model.factors if name not in table]
-    if absent:
-        raise ModelError(f"the table lacks factors that the model needs: {', '.join(absent)}")
-    wrong = [name for name in model.factors if table[name].dtype.kind not in "iufb"]
-    if wrong:
-        raise ModelError(f"factors that are no numbers: {', '.join(wrong)}")
-    return matrix(table, model.factors)
-
-
-def check_making(model: Model, made_with: Mapping[str, Any]) -> list[Outside]:
-    """Refuse factors that were computed otherwise than those that a model was trained on.
-
-    A model of several lidars judges what its card says may differ (lidar, its height, matcher,
-    usable range, blind sector) by the range that it was trained over, and refuses the rest.
-
-    Args:
-        model: a trained or loaded model.
-        made_with: what the factors were computed with: `dataset.made_with`, and what else the job
-            knows (height of the lidar, thinning of the map, how the virtual drive sees).
-
-    Returns:
-        The inputs outside of what the model was trained over, whose estimates are out of domain.
-
-    Raises:
-        ModelError: names what differs, and says what to do.
-    """
-    judged = model.card.get(JUDGED, [])
-    strange = outside(model.card["inputs"], made_with) if judged else []
-    made_with = shared(made_with, judged)
-    if "seeing" in model.made_with and "seeing" not in made_with:
-        raise ModelError("the model needs the virtual drive: give observe in the config")
-    if "seeing" in made_with and "seeing" not in model.made_with:
-        raise ModelError(
-            "the model was trained without the virtual drive: give observe: null in the config"
-        )
-    check_own(model.made_with, made_with, model.factors)
-    made_with = {name: value for name, value in made_with.items() if name != OWN}
-    unsaid = sorted(set(made_with) - set(model.made_with))
-    if unsaid:
-        raise ModelError(
-            f"the model does not say for which {' and '.join(unsaid)} it was trained, as those of "
-            "older versions do not: train it again"
-        )
-    for name in sorted((set(model.made_with) | set(made_with)) - {OWN}):
-        trained, given = model.made_with.get(name), made_with.get(name)
-        if name == "units" and isinstance(trained, Mapping) and isinstance(given, Mapping):
-            for factor in model.factors:
-                if trained.get(factor) != given.get(factor):
-                    raise ModelError(
-                        f"{factor} is in {given.get(factor)!r} in the table and was in "
-                        f"{trained.get(factor)!r} where the model was trained"
-                    )
-        elif trained != given and isinstance(trained, Mapping) and isinstance(given, Mapping):
-            differ = sorted(k for k in {*trained, *given} if trained.get(k) != given.get(k))
-            raise ModelError(
-                f"{name} does not match in {', '.join(differ)}: the model was trained with "
-                f"{_short(trained, differ)}, the table was made with {_short(given, differ)}: "
-                "train a model for it"
-            )
-        elif trained != given:
-            raise ModelError(
-                f"{name} does not match: the model was trained with {trained!r}, the table was "
-                f"made with {given!r}: train a model for it"
-            )
-    return strange
-
-
-def _short(values: Mapping[str, Any], names: Sequence[str]) -> str:
-    """The values of these names as text; of lists their length."""
-    said = {k: values.get(k) for k in ("name", *names) if k in values}
-    short = {k: f"{len(v)} values" if isinstance(v, list | tuple) else v for k, v in said.items()}
-    return ", ".join(f"{name} {value}" for name, value in short.items())
-
-
-def _reasons(
-    model: Model,
-    table: pd.DataFrame,
-    X: Float64,
-    out: Mapping[str, Float64],
-    good: NDArray[np.bool_],
-    strange: Sequence[Outside],
-) -> list[str]:
-    """(n,) words for the worst places, those outside the domain and those without an estimate; else
-    empty.
-    """
-    words = np.full(len(X), "", dtype=object)
-    worst = np.flatnonzero(good & (out["estimate"] > model.worst))
-    if worst.size:
-        places = pd.DataFrame(X[worst], columns=list(model.factors))
-        added = model.regressors[MAIN].contributions(places)
-        values = _values(table.iloc[worst], model.typical.names)
-        words[worst] = in_words(added, model.factors, values, model.typical)
-    distance = out["domain_distance"]
-    unlike = np.flatnonzero(good & (distance > model.domain.threshold))
-    wider = model.domain.widen(distance[unlike])
-    for row, k, times in zip(unlike, model.domain.farthest(X[unlike]), wider, strict=True):
-        which = model.typical.names.index(model.factors[k])
-        figures = compared(which, X[row, k], model.typical, named=True)
-        told = f"unlike the training places ({figures})"
-        told += "" if np.isnan(model.interval.level) else f", its interval {times:.2g} times wider"
-        words[row] = f"{words[row]}; {told}" if words[row] else told
-    if strange:
-        otherwise = f"seen otherwise than where the model was trained ({_listed(strange)})"
-        if not np.isnan(model.interval.level):
-            otherwise += f", its interval {model.wider_outside:.2g} times wider"
-        for row in np.flatnonzero(good):
-            words[row] = f"{words[row]}; {otherwise}" if words[row] else otherwise
-    given = table["reason"].fillna("").astype(str).to_numpy() if "reason" in table else None
-    for row in np.flatnonzero(~good):
-        bad = [name for name, x in zip(model.factors, X[row], strict=True) if not np.isfinite(x)]
-        why = f"no estimate: {bad[0]} is not a number"
-        words[row] = f"{why}: {given[row]}" if given is not None and given[row] else why
-    return [str(word) for word in words]
-
-
-def _listed(strange: Sequence[Outside]) -> str:
-    return "; ".join(map(str, strange))
-
-
-def _values(table: pd.DataFrame, names: Sequence[str]) -> Float64:
-    """(n, f) factors for reasons; NaN where the table has none of that name, or no numbers."""
-    values = np.full((len(table), len(names)), np.nan)
-    for k, name in enumerate(names):
-        if name in table and table[name].dtype.kind in "iufb":
-            values[:, k] = table[name].to_numpy(np.float64)
-    return values

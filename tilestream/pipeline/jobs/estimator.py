@@ -4,11 +4,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from tilestream.errors import ModelError
+from tilestream.model.applicability import check_making
 from tilestream.model.dataset import POINTS_MIN, WITHOUT_DRIVES
 from tilestream.model.file import load_model
 from tilestream.model.registry import UNTRAINED
 from tilestream.model.shipped import SHIPPED, file_of, is_shipped
-from tilestream.model.training import check_making
 from tilestream.pipeline.jobs.run_inputs import making_of
 from tilestream.pipeline.jobs.run_settings import RunSettings
 

@@ -11,11 +11,11 @@ from tilestream.files import Files
 from tilestream.formats import require_format
 from tilestream.formats.logs import ScanSelection, is_log
 from tilestream.formats.routes import RoutesRead
+from tilestream.model.applicability import check_making
 from tilestream.model.dataset import made_with
 from tilestream.model.file import load_model
 from tilestream.model.registry import UNTRAINED
 from tilestream.model.shipped import file_of
-from tilestream.model.training import check_making
 from tilestream.notes import Notes, noticed
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.jobs.ingest import read_sources

@@ -11,8 +11,8 @@ from tilestream.factors.rows import PLACE_COLUMNS
 from tilestream.model.covariance import COVARIANCE_COLUMNS, as_it_is, calibrated, cores
 from tilestream.model.explain import without_training
 from tilestream.model.physics import Physics
+from tilestream.model.prediction import predict as predicted
 from tilestream.model.training import ESTIMATES, PREDICTION_COLUMNS, Model
-from tilestream.model.training import predict as predicted
 from tilestream.pipeline.engine.outputs import Stored
 from tilestream.pipeline.engine.stage import stage
 from tilestream.pipeline.stages.between import Between
