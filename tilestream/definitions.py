@@ -172,7 +172,7 @@ def explain(name: str) -> Explanation:
         return Explanation(name, tuple(found))
     known = sorted({said for entry in entries() for said in _names(entry)})
     near = difflib.get_close_matches(wanted, known, n=5)
-    hint = f"did you mean {', '.join(near)}?" if near else f"sections are {', '.join(sections())}"
+    hint = f"did you mean {', '.join(near)}?" if near else f"sections are {', '.join(sections())};"
     raise UsageError(f"nothing is called {name!r}: {hint} `tilestream explain` lists all names")
 
 

@@ -68,7 +68,7 @@ class StoreNotFoundError(StoreError, FileNotFoundError):
 
 
 class StoreVersionError(StoreError):
-    """A store written by a newer version of tilestream."""
+    """A store whose layout is that of another version of tilestream."""
 
 
 class TileNotReadyError(StoreError, LookupError):

@@ -1,10 +1,10 @@
 """The way out: what a run found, as one page for people and as files for programs.
 
 ```
-data (Findings) --> segments (worst places) --> summary --+--> exports (parquet, geojson, …)
+data (Findings) --> segments (worst places) --> summary --+--> exports/ (parquet, geojson, …)
                                                           +--> charts, pictures --> page --> HTML
 comparison (Comparison) ----------------------------------+                (templates/)
-diff_data (MapDiff) --> diff_gate, diff_summary --> diff_write (diff_page, GeoJSON)
+diff/ (MapDiff: two maps beside each other)
 ```
 """
 

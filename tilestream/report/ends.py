@@ -113,7 +113,7 @@ def _lattice(at: Float64) -> tuple[float, float]:
 
 
 def _colours(error: Float64) -> Float64:
-    """(k, 3) the colour of each error; red beyond `FAILED`."""
+    """(k, 3) the colour of each error; `LOST` beyond `FAILED`."""
     colours = FIXED.rgb(error) / 255.0
     colours[error > FAILED] = to_rgb([LOST])
     return colours

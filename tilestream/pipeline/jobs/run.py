@@ -83,12 +83,11 @@ def run(
 ) -> Path | str:
     """The whole job: measure errors on drives, learn what the map says of them, estimate all.
 
-    Writes a run directory: `map.zarr/`, `tables/` (Parquet with documented columns: `factors`,
-    `observability`, `starts`, `errors`, `samples`, `judged`, `predictions`), `model.skops`,
-    `report/` (`index.html` and its data), `config.yaml` (the effective one), `run.json` (versions,
-    times over all calls, counts, failures). A job that was killed continues when it is called
-    again; what changed is redone with what depends on it. Where the map was updated, what the
-    report said before it is kept in `before/` (`ts.diff(run_dir)`).
+    Writes a run directory: `map.zarr/`, `tables/` (Parquet with documented columns: definitions,
+    section 7), `model.skops`, `report/` (`index.html` and its data), `config.yaml` (the effective
+    one), `run.json` (versions, times over all calls, counts, failures). A job that was killed
+    continues when it is called again; what changed is redone with what depends on it. Where the map
+    was updated, what the report said before it is kept in `before/` (`ts.diff(run_dir)`).
 
     Args:
         config: the settings, or a YAML file of them.

@@ -31,8 +31,8 @@ def train_over(
     """Train one model over several runs, each with its own lidar, matcher, seed or district.
 
     Args:
-        runs: by name, run directories of the main job on this disk, or datasets (`ts.dataset`),
-            which do not say more than what their factors were made with.
+        runs: by name, run directories of the main job on this disk, or what `run.dataset_of` gives
+            of them, which does not say more than what its factors were made with.
         recipe: a regressor on top of the virtual drive, which knows the lidar.
         seed: of the random numbers; the same seed and runs give the same model, to the bit.
         districts: where a run was driven, by its name. Streets of one district are the same where
