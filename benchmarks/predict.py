@@ -57,7 +57,8 @@ from tilestream.model.training import train
 from tilestream.pipeline.engine.attempt import perform
 from tilestream.pipeline.engine.outputs import Parquet
 from tilestream.pipeline.engine.stage import Product, Task
-from tilestream.pipeline.jobs.run_findings import Done, places_of
+from tilestream.pipeline.jobs.run_done import Done
+from tilestream.pipeline.jobs.run_findings import places_of
 from tilestream.pipeline.stages import factors as factors_stage
 from tilestream.pipeline.stages import observe as observe_stage
 from tilestream.pipeline.stages import predict as predict_stage

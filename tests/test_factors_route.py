@@ -71,7 +71,7 @@ def test_rows_follow_the_route_and_say_what_the_factors_of_their_places_are(
 
 def test_the_tables_name_their_map(store: ts.TileStore, table: pd.DataFrame, street: Path) -> None:
     assert len(table)
-    assert map_of(street.parent / "out").address == store.address
+    assert map_of(street.parent / "out").url == store.url
 
 
 def winding(name: str, seed: int) -> ts.Route:

@@ -203,7 +203,7 @@ def test_a_simpler_sensor_changes_the_labels_and_is_recorded(
 
 
 def test_the_tables_name_their_map(store: ts.TileStore, plain: tuple[pd.DataFrame, Path]) -> None:
-    assert map_of(plain[1]).address == store.address
+    assert map_of(plain[1]).url == store.url
 
 
 def test_a_refined_true_pose_is_recorded_and_used(

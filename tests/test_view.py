@@ -53,7 +53,7 @@ def write_places(
 ) -> None:
     rows = pd.DataFrame({"x": x}).add(OFFSET[0]).assign(y=OFFSET[1], z=OFFSET[2] + 2.0, **error)
     rows = rows.assign(status="done")
-    write_table(str(path), rows, columns, Mark("done", facts={"store": store.address}))
+    write_table(str(path), rows, columns, Mark("done", facts={"store": store.url}))
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +153,7 @@ def test_a_tile_that_cannot_be_shown_is_named(store: ts.TileStore, tmp_path: Pat
 def test_the_map_of_a_run_is_found_inside_it_or_by_its_tables(
     run_dir: Path, store: ts.TileStore, tmp_path: Path
 ) -> None:
-    assert map_of(run_dir).address == map_of(store.url).address == store.address
+    assert map_of(run_dir).url == map_of(store.url).url == store.url
     moved = tmp_path / "run"
     shutil.copytree(run_dir, moved)
     mark = Mark("done", facts={"store": str(tmp_path / "gone.zarr")})
@@ -162,7 +162,7 @@ def test_the_map_of_a_run_is_found_inside_it_or_by_its_tables(
     listed(moved)
     with pytest.raises(StoreNotFoundError, match=r"gone\.zarr.*link"):
         map_of(moved)
-    (moved / "map.zarr").symlink_to(store.address)
+    (moved / "map.zarr").symlink_to(store.url)
     assert map_of(moved).keys() == store.keys()
 
 

@@ -15,6 +15,8 @@ AXES = ("along", "across", "up", "roll", "pitch", "yaw_vector")
 """The six signed errors of a start (`start_errors`)."""
 PAIRS = tuple(itertools.combinations_with_replacement(AXES, 2))
 """Of which there are products: the upper triangle of a matrix, row by row."""
+INDICES = tuple((AXES.index(a), AXES.index(b)) for a, b in PAIRS)
+"""Row and column of each pair in that matrix."""
 SCORES = ("nvtl", "tp")
 """What a matcher says of its own result."""
 
@@ -78,16 +80,13 @@ def moments_of(prefix: str, axes: Float64, held: NDArray[np.bool_]) -> dict[str,
     with np.errstate(invalid="ignore", divide="ignore"):
         core, count = axes[held], np.float64(held.sum())
         mean = core.sum(axis=0) / count
-        square = [(core[:, i] * core[:, j]).sum() / count for i, j in _NUMBERS]
+        square = [(core[:, i] * core[:, j]).sum() / count for i, j in INDICES]
         p_fail = (~held).sum() / np.float64(len(held))
     return {
         f"{prefix}_p_fail": float(p_fail),
         **{f"{prefix}_{axis}": float(value) for axis, value in zip(AXES, mean, strict=True)},
         **{f"{prefix}_{a}_{b}": float(x) for (a, b), x in zip(PAIRS, square, strict=True)},
     }
-
-
-_NUMBERS = tuple((AXES.index(a), AXES.index(b)) for a, b in PAIRS)
 
 
 def scores_of(prefix: str, nvtl: Float64, tp: Float64, held: NDArray[np.bool_]) -> dict[str, float]:

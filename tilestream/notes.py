@@ -14,6 +14,13 @@ NAMED = 2
 """Sources that are named of those that share a note; of the others the number."""
 
 
+def some_of(names: Sequence[str], most: int) -> str:
+    """The first of some names, and how many others there are: `a, b and 3 more`."""
+    more = len(names) - most
+    told = ", ".join(names[:most])
+    return f"{told} and {more:,} more" if more > 0 else told
+
+
 class Shared(NamedTuple):
     """A note that several sources have, or one."""
 
@@ -26,9 +33,7 @@ class Shared(NamedTuple):
     @property
     def of(self) -> str:
         """Its sources in words."""
-        more = len(self.sources) - NAMED
-        named = ", ".join(self.sources[:NAMED])
-        return f"{named} and {more:,} more" if more > 0 else named
+        return some_of(self.sources, NAMED)
 
     @property
     def told(self) -> str:

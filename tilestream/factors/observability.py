@@ -31,6 +31,7 @@ from tilestream.factors.virtual_scan import (
     near_share,
     scan_in_world,
     virtual_scan,
+    whole_places,
 )
 from tilestream.factors.worlds import passed_by
 from tilestream.grid import MM_PER_M, Box
@@ -333,12 +334,6 @@ def blocks_of(places: Float64, some: Int64) -> Iterator[Int64]:
     blocks = np.floor(places[some, :2] / BLOCK).astype(np.int64)
     for block in np.unique(blocks, axis=0):
         yield some[(blocks == block).all(axis=1)]
-
-
-def whole_places(places: Float64) -> Int64:
-    """Places in whole millimetres, half to even."""
-    whole: Int64 = np.rint(places * MM_PER_M).astype(np.int64)
-    return whole
 
 
 def _headings(headings: ArrayLike, k: int) -> Float64:

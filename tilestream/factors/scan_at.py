@@ -3,7 +3,14 @@
 import numpy as np
 
 from tilestream.factors.surfels import in_view, surfel_mm, surfels_in
-from tilestream.factors.virtual_scan import Beams, Scene, look, virtual_scan
+from tilestream.factors.virtual_scan import (
+    Beams,
+    Scene,
+    look,
+    rotation_of,
+    virtual_scan,
+    whole_places,
+)
 from tilestream.factors.worlds import passed_by
 from tilestream.grid import MM_PER_M, Box
 from tilestream.kernels.fixed_order import turned
@@ -43,12 +50,10 @@ def scan_at(
     real = in_view(real, place[None], fov_deg_of(vehicle), within, beams.rim)
     if not len(real):
         return np.zeros((0, 3))
-    place_mm = np.rint(place * MM_PER_M).astype(np.int64)
+    place_mm = whole_places(place)
     scene = Scene.of(real, np.stack([place_mm, place_mm]), surfel_mm(store))
     scene = scene.without(passed_by(real.centre_mm, ~real.flat, seeing.seed, 0))
     found = look(scene, place_mm, heading, seeing, beams)
     points = virtual_scan(scene, found, place_mm, seeing, beams).points
-    c, s = np.cos(heading), np.sin(heading)
-    R_map_base = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    returns: Float64 = turned(R_map_base, points) + place_mm / MM_PER_M
+    returns: Float64 = turned(rotation_of(heading), points) + place_mm / MM_PER_M
     return returns

@@ -339,6 +339,18 @@ def _ground_below(found: tuple[Returns, ...], beams: Beams) -> float:
     return float(np.quantile(below, LOW_SHARE)) if len(below) else -USUAL_HEIGHT
 
 
+def rotation_of(heading: float) -> Float64:
+    """(3, 3) from the frame of a vehicle to that of the map, by its heading [rad]: R_map_base."""
+    c, s = np.cos(heading), np.sin(heading)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def whole_places(places: Float64) -> Int64:
+    """Places [m] in whole millimetres, half to even."""
+    whole: Int64 = np.rint(places * MM_PER_M).astype(np.int64)
+    return whole
+
+
 def _cast(
     scene: Scene,
     place_mm: Int64,
@@ -350,8 +362,7 @@ def _cast(
     """What the beams of a sensor meet between two ranges [m] from where it is, whole millimetres
     of the map, on a vehicle whose origin is at a place.
     """
-    c, s = np.cos(heading), np.sin(heading)
-    R_map_base = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    R_map_base = rotation_of(heading)
     direction = turned(R_map_base, sensor.direction)
     offset_mm = np.rint(turned(R_map_base, sensor.origin[None])[0] * MM_PER_M).astype(np.int64)
     at_mm = place_mm + offset_mm

@@ -10,6 +10,8 @@ from tilestream.model.making import inputs_of, judged_of, lidar_of, range_told, 
 JUDGED = "judged"
 """Where a card says what of a making may differ from run to run; what is not named must be equal,
 as of a model of one run all is."""
+CHECKED = "checked"
+"""Where a card says how its model was checked, and what it is worth."""
 
 
 def card_of(dataset: Dataset) -> dict[str, Any]:

@@ -13,8 +13,6 @@ from tilestream.model.intervals import coverage
 from tilestream.model.physics import Physics
 from tilestream.model.splits import protocols_of
 
-CHECKED = "checked"
-"""Where a card says what the model is worth."""
 HELD_OUT = {"path": "held-out paths", "lidar": "held-out lidar", "district": "held-out district"}
 """What the protocols are called on a card."""
 SHARES = ("p_fail",)

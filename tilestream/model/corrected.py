@@ -10,11 +10,11 @@ from sklearn.ensemble import GradientBoostingRegressor
 from sklearn.tree import DecisionTreeRegressor
 
 from tilestream.errors import ModelError
-from tilestream.model.dataset import Dataset, matrix
+from tilestream.model.dataset import Dataset
 from tilestream.model.physics import Physics, possible
 from tilestream.model.regressor import Kind, Regressor
 from tilestream.model.splits import nested_splits
-from tilestream.model.trees import TREE_TYPES, Float32, added_by_factors, leads_somewhere, sum_of
+from tilestream.model.trees import TREE_TYPES, added_by_factors, float32_of, leads_somewhere, sum_of
 from tilestream.records import Column, Float64
 
 WEIGHTS = (0.25, 0.5, 0.75, 1.0)
@@ -93,7 +93,9 @@ class Corrected(Regressor):
         if not self.weight:
             return self.physics.predict(places)
         step = self.weight * self.settings["rate"]
-        corrected = self.physics.raw(places) + step * sum_of(self.trees, self._inputs(places))
+        corrected = self.physics.raw(places) + step * sum_of(
+            self.trees, float32_of(places, self.factors)
+        )
         return possible(self.physics.target, corrected, places)
 
     def contributions(self, places: pd.DataFrame) -> Float64:
@@ -101,7 +103,7 @@ class Corrected(Regressor):
         added = self.physics.contributions(places)
         if self.weight:
             step = self.weight * self.settings["rate"]
-            added += step * added_by_factors(self.trees, self._inputs(places))
+            added += step * added_by_factors(self.trees, float32_of(places, self.factors))
         return added
 
     def importances(self) -> Float64:
@@ -142,9 +144,6 @@ class Corrected(Regressor):
             raise ModelError("a damaged model file: a tree leads nowhere")
         own = {name: settings[name] for name in cls.defaults}
         return cls(factors, own, physics, float(weight[0]), tuple(trees))
-
-    def _inputs(self, places: pd.DataFrame) -> Float32:
-        return np.ascontiguousarray(matrix(places, self.factors), np.float32)
 
 
 def _boosted(
@@ -192,7 +191,7 @@ def _weight_that_pays(dataset: Dataset, target: str, boosting: Boosting, seed: i
     for split in splits:
         train, places = dataset.take(split.train), dataset.rows.iloc[split.test]
         physics = Physics.fit(train, target)
-        X = np.ascontiguousarray(matrix(places, dataset.names), np.float32)
+        X = float32_of(places, dataset.names)
         correction = boosting.rate * sum_of(_boosted(train, physics, boosting, seed), X)
         raw, actual = physics.raw(places), label[split.test]
         plain = np.abs(possible(target, raw, places) - actual)

@@ -20,7 +20,7 @@ from tilestream.errors import ModelError, foreign_errors
 from tilestream.factors.along_route import WIDTHS, averaged_along
 from tilestream.factors.virtual_drive import RINGS
 from tilestream.label import disc_starts
-from tilestream.moments import AXES, PAIRS, SCORES, unit_of
+from tilestream.moments import AXES, INDICES, PAIRS, SCORES, unit_of
 from tilestream.records import Column, Float64
 
 ELEMENTS = tuple(f"cov_{a}_{b}" for a, b in PAIRS)
@@ -53,7 +53,6 @@ COVARIANCE_COLUMNS = (
 """What is said of a filter's registration at a place, in the frame of the route."""
 NORMAL = 0.95
 """Share of the registrations whose scores are normal."""
-_INDEX = tuple((AXES.index(a), AXES.index(b)) for a, b in PAIRS)
 _MOMENTS = (*AXES, *(f"{a}_{b}" for a, b in PAIRS))
 
 
@@ -185,7 +184,7 @@ def calibrated(core: pd.DataFrame, calibration: Calibration) -> pd.DataFrame:
     second = root[:, None] * root * about(matrices(core), core[list(BIAS)].to_numpy(), bias)
     second += np.diag(calibration.added) + bias[:, :, None] * bias[:, None, :]
     p_lost = np.clip(core["p_lost"] + calibration.lost, 0.0, 1.0)
-    found = [bias, np.column_stack([second[:, i, j] for i, j in _INDEX]), p_lost]
+    found = [bias, np.column_stack([second[:, i, j] for i, j in INDICES]), p_lost]
     reach = math.sqrt(float(chi2.ppf(NORMAL, 1)))
     for name in SCORES:
         larger, wider = calibration.scores[name]
@@ -219,7 +218,7 @@ def matrices(places: pd.DataFrame, prefix: str = "cov_") -> Float64:
         prefix: of their names.
     """
     found = np.empty((len(places), 6, 6))
-    for (a, b), (i, j) in zip(PAIRS, _INDEX, strict=True):
+    for (a, b), (i, j) in zip(PAIRS, INDICES, strict=True):
         found[:, i, j] = found[:, j, i] = places[f"{prefix}{a}_{b}"].to_numpy(np.float64)
     return found
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tilestream.model.intervals import weighted_quantile
 from tilestream.records import Float64
 
 QUANTILE = 0.99
@@ -13,8 +14,6 @@ CLIP = 5.0
 """Scaled factors beyond this do not stretch the covariance."""
 RIDGE = 1e-2
 """Variance added in every direction, of scaled factors: ratios that sum to 1 make it singular."""
-
-
 TINY = 1e-12
 """Threshold of training places that are all alike."""
 WIDEST = 3.0
@@ -78,9 +77,7 @@ def domain_of(X: Float64, block: NDArray[np.str_]) -> Domain:
         for k in range(len(names)):
             distance[index == k] = _cloud(X[index != k], 0.0).distance(X[index == k])
     weight = 1.0 / (np.bincount(index)[index] * len(names))
-    order = np.argsort(distance, kind="stable")
-    rank = int(np.searchsorted(np.cumsum(weight[order]), QUANTILE - 1e-9))
-    return _cloud(X, float(distance[order][min(rank, len(X) - 1)]))
+    return _cloud(X, weighted_quantile(distance, weight, QUANTILE))
 
 
 def _cloud(X: Float64, threshold: float) -> Domain:

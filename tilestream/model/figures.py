@@ -67,10 +67,12 @@ def figures(actual: Float64, estimate: Float64, median: Float64) -> Figures:
     )
 
 
+_TRIPLE: Sequence[str] = ("actual", "estimate", "median")
+
+
 def figures_of(points: pd.DataFrame) -> Figures:
     """The figures of `held_out` points."""
-    names = ("actual", "estimate", "median")
-    return figures(*(points[name].to_numpy(np.float64) for name in names))
+    return figures(*(points[name].to_numpy(np.float64) for name in _TRIPLE))
 
 
 SPANS = tuple(f"{name}_{end}" for name in ("skill", "spearman") for end in ("low", "high"))
@@ -177,9 +179,6 @@ def _spans(points: pd.DataFrame) -> dict[str, float]:
         skill = 1.0 - error / of_median
     ranks = resampled_spearman(actual, estimate, block, counts)
     return _ends("skill", skill, len(names)) | _ends("spearman", ranks, len(names))
-
-
-_TRIPLE: Sequence[str] = ("actual", "estimate", "median")
 
 
 def _ends(name: str, resampled_figures: Float64, blocks: int) -> dict[str, float]:

@@ -10,14 +10,14 @@ import pandas as pd
 from sklearn.ensemble import RandomForestRegressor
 
 from tilestream.errors import ModelError
-from tilestream.model.dataset import LEAST, LENGTHS, Dataset, matrix
+from tilestream.model.dataset import LEAST, LENGTHS, Dataset
 from tilestream.model.features import observed
 from tilestream.model.regressor import Kind, Regressor, held_out_estimates
 from tilestream.model.splits import block_splits
 from tilestream.model.trees import (
     TREE_TYPES,
-    Float32,
     added_by_factors,
+    float32_of,
     leads_somewhere,
     sum_of,
 )
@@ -93,7 +93,7 @@ class Forest(Regressor):
     def predict(self, places: pd.DataFrame) -> Float64:
         """(n,) estimates."""
         trees = self.trees.estimators_
-        raw = sum_of(trees, self._inputs(places)) / len(trees)
+        raw = sum_of(trees, float32_of(places, self.factors)) / len(trees)
         estimates: Float64 = np.exp(raw) if self.log else raw
         return estimates
 
@@ -101,7 +101,7 @@ class Forest(Regressor):
         """(n, f) what each factor adds along the paths through the trees: its sum over the factors,
         plus the mean over the roots, is the estimate in the trees' own unit.
         """
-        added: Float64 = added_by_factors(self.trees.estimators_, self._inputs(places))
+        added: Float64 = added_by_factors(self.trees.estimators_, float32_of(places, self.factors))
         return added / len(self.trees.estimators_)
 
     def importances(self) -> Float64:
@@ -127,9 +127,6 @@ class Forest(Regressor):
         own = {part.name: settings[part.name] for part in fields(Growth)}
         log = _of_logarithms(bool(own["log"]), target)
         return cls(factors, own, saved.set_params(n_jobs=1), log)
-
-    def _inputs(self, places: pd.DataFrame) -> Float32:
-        return np.ascontiguousarray(matrix(places, self.factors), np.float32)
 
 
 def _of_logarithms(log: bool, target: str) -> bool:

@@ -98,7 +98,7 @@ def calibrate(
     for share in SHARES:
         constant = share * typical
         miss = (actual - estimate) / (constant + estimate)
-        sides = [max(_quantile(x, even, SIDE), 0.0) for x in (-miss, miss)]
+        sides = [max(weighted_quantile(x, even, SIDE), 0.0) for x in (-miss, miss)]
         down, up = (max(side, LEAST_SIDE * max(sides), TINY) for side in sides)
         score = np.maximum(miss / up, -miss / down)
         size = _of_blocks(score, index, level) * wider_for_few(len(names), level)
@@ -160,11 +160,11 @@ def _of_blocks(score: Float64, index: NDArray[np.int64], level: float) -> float:
     hard = [np.quantile(score[index == k], level) for k in range(len(count))]
     weights = np.ones(len(count))
     weights[int(np.argmax(np.isclose(hard, max(hard))))] = 2.0  # of equals the first, if rounded
-    return _quantile(score, (weights / count)[index] / weights.sum(), level)
+    return weighted_quantile(score, (weights / count)[index] / weights.sum(), level)
 
 
-def _quantile(values: Float64, weight: Float64, share: float) -> float:
-    """The least value up to which a share of the weight lies; the weights sum to 1."""
+def weighted_quantile(values: Float64, weight: Float64, share: float) -> float:
+    """The least of (n,) values up to which a share of their (n,) weights lies, which sum to 1."""
     order = np.argsort(values, kind="stable")
     # Sums of weights are not exact: 1e-9 keeps rounding from passing over the last point.
     rank = int(np.searchsorted(np.cumsum(weight[order]), share - 1e-9))

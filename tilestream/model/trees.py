@@ -8,14 +8,21 @@ from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 from sklearn.tree import DecisionTreeRegressor
 
+from tilestream.model.dataset import matrix
 from tilestream.records import Float64
 
 TREE_TYPES = frozenset({"sklearn.tree._classes.DecisionTreeRegressor", "sklearn.tree._tree.Tree"})
 """What skops builds to read a tree."""
 Float32: TypeAlias = NDArray[np.float32]
+
+
+def float32_of(places: pd.DataFrame, factors: Sequence[str]) -> Float32:
+    """(n, f) these factors of n places, as trees read them."""
+    return np.ascontiguousarray(matrix(places, factors), np.float32)
 
 
 def sum_of(trees: Sequence[DecisionTreeRegressor], X: Float32) -> Float64:

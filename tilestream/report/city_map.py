@@ -107,7 +107,7 @@ def city_map(found: Findings, tip: str) -> dict[str, Any]:
         # of the dots under the mouse the worst, which is the one on top
         plot.add_tools(hover(glyphs, tip, sort_by=[("estimate", -1)]))
     _draw_measured(plot, found, origin, (tip, mapper))
-    _number_the_worst(plot, places, origin)
+    number_the_worst(plot, places.iloc[worst_places(places)], origin)
     mark_here(plot, origin)
     if np.isfinite(estimate).any():
         plot.add_layout(colour_bar(found.scale, mapper), "below")
@@ -190,7 +190,12 @@ def origin_of(places: pd.DataFrame) -> Float64:
     """A round corner near the places, so that axes need not show seven digits [m]."""
     at = places[["x", "y"]].to_numpy(np.float64)
     at = at[np.isfinite(at).all(axis=1)]
-    corner = np.floor(at.min(axis=0) / 1000.0) * 1000.0 if len(at) else np.zeros(2)
+    return round_corner(at.min(axis=0)) if len(at) else np.zeros(2)
+
+
+def round_corner(low: Float64) -> Float64:
+    """A corner (2,) at or below another one [m], round, or 0 where that needs few digits too."""
+    corner = np.floor(low / 1000.0) * 1000.0
     return np.where(np.abs(corner) >= 10_000.0, corner, 0.0)
 
 
@@ -249,13 +254,11 @@ def _draw_measured(plot: figure, found: Findings, origin: Float64, how: tuple[st
     plot.add_tools(hover(glyphs, tip, sort_by=[("measured", -1)]))
 
 
-def _number_the_worst(plot: figure, places: pd.DataFrame, origin: Float64) -> None:
-    rows = worst_places(places)
-    if not rows:
+def number_the_worst(plot: figure, worst: pd.DataFrame, origin: Float64) -> None:
+    """A number at each of the worst places, which have `x` and `y` [m], the worst first."""
+    if worst.empty:
         return
-    at = places[["x", "y"]].to_numpy(np.float64)[rows] - origin
-    source = ColumnDataSource(
-        {"x": at[:, 0], "y": at[:, 1], "number": [str(k + 1) for k in range(len(rows))]},
-        name="worst",
-    )
+    at = worst[["x", "y"]].to_numpy(np.float64) - origin
+    numbers = [str(k + 1) for k in range(len(worst))]
+    source = ColumnDataSource({"x": at[:, 0], "y": at[:, 1], "number": numbers}, name="worst")
     plot.text("x", "y", "number", source=source, **NUMBER)

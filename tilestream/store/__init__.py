@@ -227,6 +227,7 @@ class TileStore:
 
     def __init__(self, url: str | os.PathLike[str], settings: StoreSettings) -> None:
         self.url = place_of(url)
+        """Where it lies: an absolute path, or a URL."""
         self.settings = settings
         self.grid = TileGrid.of(settings.tile_size, settings.halo)
 
@@ -234,11 +235,6 @@ class TileStore:
     def files(self) -> Files:
         """Where it lies."""
         return Files.at(self.url)
-
-    @property
-    def address(self) -> str:
-        """The store's URL; of a local store its absolute path, for readers started elsewhere."""
-        return self.url
 
     def __getstate__(self) -> dict[str, Any]:
         return {"url": self.url, "settings": self.settings, "grid": self.grid}

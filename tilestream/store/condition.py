@@ -7,6 +7,7 @@ from tilestream.errors import IncompleteError
 from tilestream.grid import TileKey
 from tilestream.lock import Holder
 from tilestream.marks import Mark
+from tilestream.notes import some_of
 from tilestream.store.record import State
 
 NAMED = 5
@@ -44,8 +45,7 @@ class Condition:
             return f"being written by {self.writer}: wait until that ends"
         if self.state == "whole":
             names = [str(key) for key in self.lost]
-            more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-            tiles = f"tile{'s' if len(names) > 1 else ''} {', '.join(names[:NAMED])}{more}"
+            tiles = f"tile{'s' if len(names) > 1 else ''} {some_of(names, NAMED)}"
             return f"damaged, it has lost {tiles}: ingest its sources again, which makes these anew"
         return "half-made: its ingest was stopped; run the same command again to end it"
 

@@ -16,6 +16,7 @@ from tilestream.formats.points.pcd import open_pcd
 from tilestream.formats.points.rows import RowSource, whole_span
 from tilestream.formats.projector import CLOUD, METADATA, PROJECTOR, read_mapping, read_projector
 from tilestream.formats.registry import Format
+from tilestream.notes import some_of
 
 
 @dataclass(frozen=True)
@@ -157,10 +158,9 @@ def _check_corner(name: Any, corner: Any, metadata: Path) -> None:
 def _refuse_missing(files: list[Path], metadata: Path) -> None:
     missing = sorted(file.name for file in files if not file.is_file())
     if missing:
-        more = f" and {len(missing) - 5} more" if len(missing) > 5 else ""
         raise SourceNotFoundError(
             f"{metadata}: lists {len(missing)} of {len(files)} files that are missing: "
-            f"{', '.join(missing[:5])}{more}; copy them, or take them out of the list"
+            f"{some_of(missing, 5)}; copy them, or take them out of the list"
         )
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from tilestream.errors import UsageError
 from tilestream.files import Files, without_secrets
+from tilestream.notes import some_of
 from tilestream.pipeline.engine.plan import megabytes
 
 ANSWER_WITHIN = 120.0
@@ -68,9 +69,8 @@ def require_seen(
         if answer and not isinstance(answer, OSError):  # which says that this worker is gone
             blind.setdefault(_told(answer), []).append(worker)
     for reason, those in blind.items():
-        more = f" and {len(those) - NAMED} more" if len(those) > NAMED else ""
         many = "workers" if len(those) > 1 else "worker"
-        raise UsageError(f"{many} {', '.join(those[:NAMED])}{more} {reason}")
+        raise UsageError(f"{many} {some_of(those, NAMED)} {reason}")
 
 
 def _some_of(inputs: Sequence[str]) -> list[str]:

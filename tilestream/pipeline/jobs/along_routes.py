@@ -16,6 +16,7 @@ from tilestream.factors.rows import Samples, in_route_order, samples_by_tile
 from tilestream.files import place_of
 from tilestream.grid import MM_PER_M, TileGrid, TileKey, whole_mm
 from tilestream.matcher import RegistrationSettings
+from tilestream.notes import some_of
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.engine.plan import Plan, paths_of
 from tilestream.pipeline.engine.stage import Stage
@@ -134,8 +135,7 @@ def off_map(keys: Iterable[TileKey], grid: TileGrid, routes: Iterable[Route]) ->
             found.append(f"{route.route_id} ({places})")
     if not found:
         return []
-    more = f" and {len(found) - TOLD} more" if len(found) > TOLD else ""
-    told = f"no tile of the map is within {REACH:g} m of {', '.join(found[:TOLD])}{more}"
+    told = f"no tile of the map is within {REACH:g} m of {some_of(found, TOLD)}"
     return [f"{told}: nothing is known there"]
 
 

@@ -14,6 +14,7 @@ from tilestream.errors import DamagedError, IncompleteError, UsageError
 from tilestream.files import Files, place_of
 from tilestream.lock import only_writer
 from tilestream.marks import sealed, unsealed
+from tilestream.notes import some_of
 from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.outputs import Parquet, TileArrays, way_to
 from tilestream.pipeline.engine.plan import Plan
@@ -155,10 +156,9 @@ def tables_in(folder: str) -> list[str]:
         elif not entry.failed:
             missing.append(path)
     if missing:
-        first, several = missing[0].rsplit("/", 1)[1], len(missing) > 1
+        names = some_of([path.rsplit("/", 1)[1] for path in missing], 1)
         raise IncompleteError(
-            f"{folder} is half-made or has lost tables: {first}"
-            f"{f' and {len(missing) - 1} more' if several else ''}; run the job that makes them "
+            f"{folder} is half-made or has lost tables: {names}; run the job that makes them "
             "again, which continues where it was"
         )
     for name in Files.at(folder).names():

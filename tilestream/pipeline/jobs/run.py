@@ -38,15 +38,9 @@ from tilestream.pipeline.jobs.run_book import (
     checksums,
     machine,
     told_before,
-    write_text,
 )
-from tilestream.pipeline.jobs.run_findings import (
-    Done,
-    findings_of,
-    heights_told,
-    offset_told,
-    without,
-)
+from tilestream.pipeline.jobs.run_done import Done, without
+from tilestream.pipeline.jobs.run_findings import findings_of
 from tilestream.pipeline.jobs.run_inputs import (
     JOB,
     Inputs,
@@ -59,8 +53,10 @@ from tilestream.pipeline.jobs.run_lanes import lanelet_maps_of
 from tilestream.pipeline.jobs.run_names import RECORD
 from tilestream.pipeline.jobs.run_notes import (
     drives_measured,
+    heights_told,
     log_poses_told,
     lost_labels,
+    offset_told,
     run_notes,
 )
 from tilestream.pipeline.jobs.run_plan import places_to_train
@@ -199,7 +195,7 @@ def dataset_of(run_dir: str | os.PathLike[str]) -> Dataset:
 def _begin(settings: RunSettings) -> Book:
     """The run directory with the effective settings."""
     text = yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
-    write_text(settings.folder.under("config.yaml"), text)
+    settings.folder.under("config.yaml").write(text.encode())
     return Book(settings.folder, told_before(settings.folder.under(RECORD)))
 
 
@@ -247,7 +243,7 @@ def _report(settings: RunSettings, inputs: Inputs, story: Story, book: Book) -> 
             f"no place has one: {reasons_told(by_reason(found.places['reason']))}"
         )
     text = json.dumps(plain(evaluation), indent=1, allow_nan=False)
-    write_text(settings.folder.under("tables/evaluation.json"), text + "\n")
+    settings.folder.under("tables/evaluation.json").write(f"{text}\n".encode())
     write_report(found, f"{settings.out}/report", threshold=settings.report.threshold)
     tell(settings, story.map_plan)
     book.facts["report"] = f"{settings.out}/report/index.html"

@@ -19,7 +19,7 @@ from tilestream.files import Files
 from tilestream.grid import TileKey
 from tilestream.marks import AGAIN, hash_of, sealed, unsealed
 from tilestream.pipeline.jobs.map_update import Update
-from tilestream.pipeline.jobs.run_book import checksum_of, write_text
+from tilestream.pipeline.jobs.run_book import checksum_of
 from tilestream.pipeline.jobs.run_inputs import making_of
 from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.jobs.run_state import record_of
@@ -61,7 +61,8 @@ def tell(settings: RunSettings, map_plan: MapPlan) -> None:
         _hash(settings),
         checksum_of(report.under(PLACES)),
     )
-    write_text(report.under(TILES), json.dumps(sealed(asdict(told)), indent=0) + "\n")
+    text = json.dumps(sealed(asdict(told)), indent=0) + "\n"
+    report.under(TILES).write(text.encode())
 
 
 def update_of(settings: RunSettings, map_plan: MapPlan) -> Update | None:

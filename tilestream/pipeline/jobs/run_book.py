@@ -89,7 +89,8 @@ class Book:
             **self.facts,
         }
         plain = json.loads(json.dumps(content, default=str))
-        write_text(self.folder.under(RECORD), json.dumps(sealed(plain), indent=2) + "\n")
+        text = json.dumps(sealed(plain), indent=2) + "\n"
+        self.folder.under(RECORD).write(text.encode())
         self.written = time.time()
         return content
 
@@ -165,11 +166,6 @@ def content_as_written(file: Files, record: Mapping[str, Any], name: str) -> byt
     if known is not None and known != f"{zlib.crc32(content):08x}":
         raise DamagedError(f"{file.address} is damaged, its checksum does not fit: {AGAIN}")
     return content
-
-
-def write_text(file: Files, text: str) -> None:
-    """Write a text file: whole, or as it was."""
-    file.write(text.encode())
 
 
 def machine() -> dict[str, Any]:

@@ -1,39 +1,33 @@
 """What the main job found: the tables of a run directory, gathered for its report."""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from tilestream.errors import ModelError
-from tilestream.factors.along_route import AVERAGED, WIDTH
-from tilestream.factors.heights import note_of_drive, notes_of_routes
+from tilestream.factors.along_route import AVERAGED
 from tilestream.factors.scan_at import scan_at
 from tilestream.factors.stations import INTERPOLATED
 from tilestream.from_above import FromAbove, seen_from_above
 from tilestream.grid import MM_PER_M, Box, TileKey
 from tilestream.model.covariance import COVARIANCE_COLUMNS
-from tilestream.model.dataset import POINTS_MIN, TARGETS, Dataset, nearest_along
+from tilestream.model.dataset import TARGETS, Dataset, nearest_along
 from tilestream.model.evaluation import (
-    differences_by_protocol,
     factor_sets,
-    figures_by_protocol,
 )
 from tilestream.model.file import load_model
-from tilestream.model.intervals import coverage, with_intervals
+from tilestream.model.intervals import with_intervals
 from tilestream.model.physics import Physics
-from tilestream.model.registry import REGRESSORS, UNTRAINED
-from tilestream.model.repeats import repeated
+from tilestream.model.registry import UNTRAINED
 from tilestream.model.shipped import SHIPPED, file_of
 from tilestream.model.training import MAIN, PREDICTION_COLUMNS
 from tilestream.pipeline.engine.plan import paths_of
-from tilestream.pipeline.engine.stage import Task
 from tilestream.pipeline.jobs.estimator import Estimator
+from tilestream.pipeline.jobs.run_done import Done, without
+from tilestream.pipeline.jobs.run_evaluation import ceilings, evaluation_of
 from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.jobs.run_worth import worth_of
-from tilestream.pipeline.stages.evaluate import by_protocol
 from tilestream.pipeline.stages.samples import places_with_factors
 from tilestream.records import Float64
 from tilestream.report.data import AROUND, BESIDE, Findings, Seen
@@ -50,40 +44,6 @@ ROUNDING = 1e-6
 """How far a label may be beyond half a spacing of the place that has it [m]."""
 _NO_POINTS = pd.DataFrame({name: [] for name in ("row", "estimate", "low", "high")})
 """Where nothing could be held out."""
-
-
-@dataclass(frozen=True)
-class Done:
-    """The tasks of a run that are done."""
-
-    tasks: tuple[Task, ...]
-
-    def outputs(self, stage: str) -> tuple[Task, ...]:
-        """Those of a stage."""
-        return tuple(task for task in self.tasks if task.stage == stage)
-
-    def dataset(self) -> Dataset | None:
-        """The joined dataset; None: nothing was measured, or it could not be joined."""
-        joined = self.outputs("samples")
-        return joined[0].writes.read() if joined else None
-
-    def evaluations(self) -> dict[tuple[str, str, str], dict[str, pd.DataFrame | str]]:
-        """What was evaluated, by (target, competitor, factor set; empty: all factors)."""
-        return {
-            (t.takes["target"], t.takes["competitor"], t.takes["factor_set"]): by_protocol(
-                t.writes.read()
-            )
-            for t in self.outputs("evaluate")
-        }
-
-    @property
-    def width(self) -> float:
-        """Over what the virtual drives of the estimates are averaged along the route [m]."""
-        for task in self.outputs("predict")[:1]:
-            model = task.reads.get("model")
-            if model is not None and not isinstance(model, tuple):
-                return float(model.read().width)
-        return WIDTH
 
 
 def places_of(done: Done) -> pd.DataFrame:
@@ -109,30 +69,6 @@ def places_of(done: Done) -> pd.DataFrame:
     between = joined["status"] == INTERPOLATED  # their kernels are not whole
     joined.loc[between, [name for name in AVERAGED if name in joined]] = np.nan
     return joined.astype(dtypes)
-
-
-def heights_told(done: Done, settings: RunSettings) -> dict[str, list[str]]:
-    """What the heights of the routes and of the drives' lidars tell, by what it is about."""
-    places = read_tables(paths_of(done.outputs("factors")))
-    notes = {"routes": notes_of_routes(places, settings.sensor_height, settings.route_z)}
-    of_drive: dict[str, list[str]] = {}
-    for path in paths_of(done.outputs("label")):
-        of_drive.setdefault(path.rsplit("/", 2)[1], []).append(path)
-    for name, paths in of_drive.items():
-        heights = read_tables(paths)["lidar_height"]
-        notes[f"drive {name}"] = note_of_drive(heights, settings.sensor_height)
-    return notes
-
-
-def offset_told(labelled: int, settings: RunSettings, estimator: Estimator) -> list[str]:
-    """A note where `physics` makes the estimates as it is, with so many labels to learn from, and
-    nobody asked for that.
-    """
-    fits = estimator.untrained and not estimator.few
-    if not labelled or settings.model.offset is not None or not fits:
-        return []
-    told = f"{labelled} places are measured, and a model needs {POINTS_MIN}: the estimates are the"
-    return [f"{told} virtual drive as it is (model.offset 0)."]
 
 
 def mapped_told(mapped: Sequence[str]) -> str:
@@ -184,73 +120,6 @@ def labels_of(
         physics = Physics.as_it_is(MAIN, offset)
         found.loc[others, "held_out"] = physics.predict(found[others])
     return found
-
-
-def evaluation_of(
-    found: Mapping[tuple[str, str, str], Mapping[str, pd.DataFrame | str]],
-    sets: Sequence[str],
-    recipe: str,
-) -> dict[str, pd.DataFrame]:
-    """Evaluations as tables: `protocols`, `table_iv`, `coverage`, `parts` for other targets, and
-    `differences` between the model in use and physics.
-
-    Args:
-        found: what was evaluated (`Done.evaluations`).
-        sets: the factor sets of Table IV in its order; the last has all factors.
-        recipe: the model in use.
-    """
-    rows = {key: figures_by_protocol(points, key[1]) for key, points in found.items()}
-    protocols = [
-        table for (target, _, chosen), table in rows.items() if (target, chosen) == (MAIN, "")
-    ]
-    stored_as = {name: "" if name == sets[-1] else name for name in sets}
-    four = [
-        rows[MAIN, model, chosen].assign(factors=name)
-        for model in REGRESSORS
-        for name, chosen in stored_as.items()
-        if (MAIN, model, chosen) in rows
-    ]
-    parts = [table.assign(target=t) for (t, _, _), table in rows.items() if t != MAIN]
-    differences = [
-        differences_by_protocol(points, found[target, UNTRAINED, ""]).assign(target=target)
-        for (target, model, chosen), points in found.items()
-        if (model, chosen) == (recipe, "") and recipe != UNTRAINED
-        if (target, UNTRAINED, "") in found
-    ]
-    held = found.get((MAIN, recipe, ""), {}).get("path", "")
-    return {
-        "protocols": _joined(protocols),
-        "table_iv": _joined(four),
-        "parts": _joined(parts),
-        "differences": _joined(differences),
-        "coverage": pd.DataFrame() if isinstance(held, str) else coverage(held),
-    }
-
-
-def _joined(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
-    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
-
-
-def ceilings(dataset: Dataset | None, targets: Sequence[str]) -> dict[str, dict[str, float]]:
-    """What a repeated drive knows of each target, and what any estimate could know (`repeated`);
-    empty without one.
-    """
-    found: dict[str, dict[str, float]] = {}
-    for target in targets:
-        if dataset is not None and target in dataset.rows:
-            try:
-                found[target] = repeated(dataset, target)
-            except ModelError:
-                return {}
-    return found
-
-
-def without(dataset: Dataset | None, groups: Collection[str]) -> Dataset | None:
-    """The dataset without these groups; None: nothing is left."""
-    if dataset is None or not groups:
-        return dataset
-    left = [name for name in dataset.rows["group"].unique() if name not in groups]
-    return dataset.groups(left) if left else None
 
 
 def findings_of(

@@ -1,4 +1,4 @@
-"""What a run noticed of its inputs, and how much of its drives it measured and can use."""
+"""What a run noticed of its inputs and labels, and how much of its drives it can use."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -7,13 +7,16 @@ from typing import Any
 import pandas as pd
 
 from tilestream.errors import SourceError
-from tilestream.model.dataset import Dataset
+from tilestream.factors.heights import note_of_drive, notes_of_routes
+from tilestream.model.dataset import POINTS_MIN, Dataset
 from tilestream.model.join import KEPT_BY, NOT_A_NUMBER
 from tilestream.notes import MATCHER, noticed
+from tilestream.pipeline.engine.plan import paths_of
 from tilestream.pipeline.jobs.along_routes import off_map
 from tilestream.pipeline.jobs.drive_measured import to_measure, with_labels
+from tilestream.pipeline.jobs.estimator import Estimator
 from tilestream.pipeline.jobs.localize import drive_overlap
-from tilestream.pipeline.jobs.run_findings import Done
+from tilestream.pipeline.jobs.run_done import Done
 from tilestream.pipeline.jobs.run_inputs import (
     JOB,
     Inputs,
@@ -28,6 +31,7 @@ from tilestream.pipeline.stages.label import label
 from tilestream.report.drives import DriveMeasured
 from tilestream.report.log_poses import note_of_log_poses
 from tilestream.store import TileStore
+from tilestream.tables import read_tables
 
 NO_ROWS = pd.DataFrame({"status": [], "reason": []})
 """Where a drive has no labels."""
@@ -99,6 +103,26 @@ def drives_measured(inputs: Inputs, done: Done) -> tuple[DriveMeasured, ...]:
     return tuple(
         with_labels(drive, tables.get(drive.drive, NO_ROWS)) for drive in inputs.to_measure
     )
+
+
+def heights_told(done: Done, settings: RunSettings) -> dict[str, list[str]]:
+    """What the heights of the routes and of the drives' lidars tell, by what it is about."""
+    places = read_tables(paths_of(done.outputs("factors")))
+    notes = {"routes": notes_of_routes(places, settings.sensor_height, settings.route_z)}
+    for name, rows in labels_by_drive(done.outputs(label.name)).items():
+        notes[f"drive {name}"] = note_of_drive(rows["lidar_height"], settings.sensor_height)
+    return notes
+
+
+def offset_told(labelled: int, settings: RunSettings, estimator: Estimator) -> list[str]:
+    """A note where `physics` makes the estimates as it is, with so many labels to learn from, and
+    nobody asked for that.
+    """
+    fits = estimator.untrained and not estimator.few
+    if not labelled or settings.model.offset is not None or not fits:
+        return []
+    told = f"{labelled} places are measured, and a model needs {POINTS_MIN}: the estimates are the"
+    return [f"{told} virtual drive as it is (model.offset 0)."]
 
 
 def log_poses_told(done: Done) -> dict[str, list[str]]:

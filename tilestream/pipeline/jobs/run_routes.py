@@ -9,6 +9,7 @@ from tilestream.counts import count_of
 from tilestream.errors import UsageError
 from tilestream.formats.logs import is_log
 from tilestream.formats.routes import RoutesRead, read_all_routes, read_each
+from tilestream.notes import some_of
 from tilestream.patterns import paths_of
 from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.jobs.sources import crs_of_map
@@ -38,8 +39,9 @@ def routes_of_map(settings: RunSettings) -> tuple[RoutesRead, list[str], str]:
             "or a log of the survey"
         )
     read = routes_in(logs, settings, settings.map.sources).at_least(settings.spacing)
-    told = f"no routes were given, and the map has no lanes: the way of its survey, {logs[0]}"
-    told += f" and {len(logs) - 1} more" if len(logs) > 1 else ""
+    told = (
+        f"no routes were given, and the map has no lanes: the way of its survey, {some_of(logs, 1)}"
+    )
     return read, logs, told
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 from scipy.stats import spearmanr
 
+from tilestream.model.card import CHECKED
 from tilestream.report.data import estimates, like_training
 from tilestream.report.formatting import known
 from tilestream.report.worth import (
@@ -25,8 +26,6 @@ FEW_PLACES = 500
 REAL = "real drives"
 """The entry of a card's `checked` that is of real drives; the others are what was held out of the
 data that it was trained on."""
-CHECKED = "checked"
-"""Where a card says how its model was checked."""
 
 
 def worth_of(

@@ -7,7 +7,8 @@ from typing import Any
 
 from tilestream.errors import SourceNotFoundError, UsageError
 from tilestream.files import Files, place_of
-from tilestream.model.checked import CHECKED, checked_of
+from tilestream.model.card import CHECKED
+from tilestream.model.checked import checked_of
 from tilestream.model.dataset import Dataset
 from tilestream.model.file import save_model
 from tilestream.model.over_runs import DISTRICT, Run, over_runs

@@ -66,7 +66,7 @@ def factors(
     positions = places[["x", "y", "z"]].to_numpy()
     cache = _cache(map_part.store_url, looking.cell_size, map_part.state)
     found = factors_of(store, positions, looking.sensor, looking.cell_size, looking.which, cache)
-    facts = {"data_set": canonical(looking), "store": store.address}
+    facts = {"data_set": canonical(looking), "store": store.url}
     if not own:
         return Made(with_places(found, places, why), facts)
     looked = places[["x", "y", "z", "heading"]].assign(status=found["status"])

@@ -132,7 +132,7 @@ def register(
             facts[str(sample.scan)] = place | {"points": points, "reason": ""}
     names = {column.name: column.dtype for column in START_COLUMNS}
     frame = pd.concat(rows, ignore_index=True)[list(names)].astype(names)
-    known = {"data_set": canonical(measuring), "store": map_part.store.address}
+    known = {"data_set": canonical(measuring), "store": map_part.store.url}
     return Made(frame, {**known, "scans": facts})
 
 

@@ -15,11 +15,11 @@ from tilestream.report.charts import finish, hover, item, new_plot
 from tilestream.report.city_map import (
     MAP_TOOLS,
     MOST,
-    NUMBER,
     colour_bar,
     draw_map,
     mark_here,
     name_axes,
+    number_the_worst,
     origin_of,
 )
 from tilestream.report.colours import FIXED, MISSING, Scale
@@ -106,7 +106,7 @@ def diff_map(found: MapDiff, tip: str) -> dict[str, Any]:
             style |= {"line_width": 2.0}
         glyphs = plot.scatter("x", "y", source=source, marker=marker, legend_label=name, **style)
         plot.add_tools(hover(glyphs, tip, sort_by=[("weight", -1)]))
-    _number_the_worst(plot, found, origin)
+    number_the_worst(plot, found.places.stretches.head(MOST_NUMBERS), origin)
     mark_here(plot, origin)
     if len(table):
         for scale, title, of in ((FIXED, "error [cm]", "error"), (CHANGE, "change [cm]", "change")):
@@ -219,16 +219,6 @@ def _outline(
         **style,
     )
     plot.add_tools(hover(quads, f"tile @tile, {kind}"))
-
-
-def _number_the_worst(plot: figure, found: MapDiff, origin: Float64) -> None:
-    worst = found.places.stretches.head(MOST_NUMBERS)
-    if worst.empty:
-        return
-    at = worst[["x", "y"]].to_numpy(np.float64) - origin
-    numbers = [str(k + 1) for k in range(len(worst))]
-    source = ColumnDataSource({"x": at[:, 0], "y": at[:, 1], "number": numbers}, name="worst")
-    plot.text("x", "y", "number", source=source, **NUMBER)
 
 
 def _corners(found: MapDiff) -> pd.DataFrame:

@@ -29,7 +29,7 @@ from tilestream.pipeline.engine.progress import (
     Progress,
 )
 from tilestream.records import Float64
-from tilestream.report.city_map import MAP_TOOLS, NORTH, SCALE_BAR
+from tilestream.report.city_map import MAP_TOOLS, NORTH, SCALE_BAR, round_corner
 from tilestream.report.colours import FIXED, MISSING
 from tilestream.report.formatting import CM_PER_M, NONE
 from tilestream.report.relief import GREY
@@ -182,9 +182,7 @@ class TileMap:
         """A round corner near the tiles, so that axes need not show seven digits [m]."""
         if self._tile_mm is None or not self._progress.tiles:
             return np.zeros(2)
-        low = np.min(self._progress.tiles, axis=0) * (self._tile_mm / MM_PER_M)
-        corner = np.floor(low / 1000.0) * 1000.0
-        return np.where(np.abs(corner) >= 10_000.0, corner, 0.0)
+        return round_corner(np.min(self._progress.tiles, axis=0) * (self._tile_mm / MM_PER_M))
 
     def _images(self, patches: Iterable[Patch]) -> dict[str, Any]:
         left, low = self._origin
