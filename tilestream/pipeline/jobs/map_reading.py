@@ -21,15 +21,10 @@ from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.engine.stage import Task
 from tilestream.pipeline.jobs.sources import Source, as_read, as_remembered
 from tilestream.pipeline.jobs.strays import without_strays
+from tilestream.pipeline.stages.fragments import Fragment, fragments_of
 from tilestream.pipeline.stages.map_plan import MapPlan, TilePoints
 from tilestream.pipeline.stages.merge import merge, merge_tasks
-from tilestream.pipeline.stages.scatter import (
-    Fragment,
-    SourceSpan,
-    fragments_of,
-    scatter,
-    scatter_tasks,
-)
+from tilestream.pipeline.stages.scatter import SourceSpan, scatter, scatter_tasks
 from tilestream.store import Manifest, Share, Shares, TileStore, added
 
 MADE_BY = {stage.name: stage.version for stage in (scatter, merge)}

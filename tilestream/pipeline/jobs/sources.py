@@ -19,7 +19,8 @@ from tilestream.notes import noticed
 from tilestream.pipeline.engine.plan import megabytes
 from tilestream.pipeline.jobs.overlap import packed
 from tilestream.pipeline.jobs.strays import Kept
-from tilestream.pipeline.stages.scatter import Fragment, needed_to_open
+from tilestream.pipeline.stages.fragments import Fragment
+from tilestream.pipeline.stages.scatter import needed_to_open
 from tilestream.settings import IngestSettings, LogOptions, LogSettings, MapSettings
 from tilestream.store import TileStore, open_store
 
@@ -164,14 +165,14 @@ def with_crs(settings: IngestSettings, found: Sequence[Source]) -> IngestSetting
     return settings.model_copy(update={"crs": one_crs(settings.crs, named)})
 
 
-def as_read(source: Source, indices: Sequence[Fragment], kept: Kept) -> Source:
+def as_read(source: Source, fragments: Sequence[Fragment], kept: Kept) -> Source:
     """A source with what was read of it, and what was left out."""
-    left_out = sum(index.left_out for index in indices)
+    left_out = sum(one.left_out for one in fragments)
     told = kept.notes
     if left_out:
         why = "points of a class of noise (7 or 18) or withheld are left out"
         told += (f"{left_out:,} {why}; keep_noise (--keep-noise) keeps them",)
-    dropped = sum(index.dropped for index in indices)
+    dropped = sum(one.dropped for one in fragments)
     return replace(source, told=told, points=kept.points, dropped=dropped)
 
 

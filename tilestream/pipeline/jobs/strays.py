@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from tilestream.errors import CorruptSourceError
 from tilestream.grid import TileGrid
 from tilestream.kernels.fixed_order import norms
-from tilestream.pipeline.stages.scatter import Fragment
+from tilestream.pipeline.stages.fragments import Fragment
 from tilestream.records import Int64
 
 FAR = 10_000.0

@@ -12,14 +12,8 @@ from tilestream.kernels.thinning import sort, thin
 from tilestream.marks import hash_of
 from tilestream.pipeline.engine.outputs import Made, TileArrays
 from tilestream.pipeline.engine.stage import BASE_BYTES, Counts, Task, stage
-from tilestream.pipeline.stages.scatter import (
-    Fragment,
-    Int32,
-    Print,
-    add_prints,
-    fragments_of,
-    prints_of,
-)
+from tilestream.pipeline.stages.fragments import Fragment, Int32, Print, add_prints, fragments_of
+from tilestream.pipeline.stages.scatter import prints_of
 from tilestream.store import POINTS, Share, TileStore
 
 BATCH_POINTS = 500_000
