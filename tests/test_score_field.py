@@ -11,7 +11,7 @@ from tilestream.factors.local_similarity import (
     entropy,
     secondary_peaks,
 )
-from tilestream.kernels import score_field
+from tilestream.kernels import shift_sums
 from tilestream.kernels.density import magnusson_constants
 from tilestream.kernels.nearest import group_by_cell
 from tilestream.kernels.neighbours import cells_around
@@ -143,7 +143,7 @@ def test_the_scores_of_a_symmetric_cell_are_symmetric() -> None:
 @pytest.mark.interpreted
 def test_a_value_is_a_power_of_two() -> None:
     for exponent in np.float32([0.0, 0.25, 0.999999, 1.0, 7.3, 23.9, 31.0]):
-        value = score_field._value(exponent)
+        value = shift_sums._value(exponent)
         assert value == pytest.approx(2.0 ** (24.0 - float(exponent)), rel=3e-7, abs=1.0)
 
 
