@@ -47,15 +47,17 @@ from scipy.stats import spearmanr
 from street_tiles import TILE, Floats, long_street
 
 import tilestream as ts
+from tilestream.factors.beams import Beams
 from tilestream.factors.hessian import hessian_factors
 from tilestream.factors.observability import (
     in_view,
     observability,
     whole_places,
 )
+from tilestream.factors.scene import Scene
 from tilestream.factors.surfels import surfel_mm, surfels_in, tile_surfels
 from tilestream.factors.virtual_drive import ends_of, stratified_starts, virtual_drive
-from tilestream.factors.virtual_scan import Beams, Scene, look, scan_in_world, virtual_scan
+from tilestream.factors.virtual_scan import look, scan_in_world, virtual_scan
 from tilestream.factors.worlds import passed_by
 from tilestream.formats.logs import open_log
 from tilestream.formats.points.pcd import write_pcd

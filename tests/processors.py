@@ -8,8 +8,10 @@ from numpy.typing import NDArray
 from scenes import PLACES
 
 import tilestream as ts
+from tilestream.factors.beams import Beams
+from tilestream.factors.scene import Scene
 from tilestream.factors.surfels import surfel_mm, surfels_in
-from tilestream.factors.virtual_scan import Beams, Scene, look, virtual_scan
+from tilestream.factors.virtual_scan import look, virtual_scan
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.grid import Box
 from tilestream.settings import VirtualSettings

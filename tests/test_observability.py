@@ -12,11 +12,13 @@ from scenes import PLACES
 
 import tilestream as ts
 from tilestream.errors import UsageError
+from tilestream.factors.beams import Beams
 from tilestream.factors.hessian import hessian_factors, information
 from tilestream.factors.observability import (
     COLUMNS,
     observability,
 )
+from tilestream.factors.scene import Scene
 from tilestream.factors.surfels import Surfels, can_be_met, in_view, surfels_in
 from tilestream.factors.virtual_drive import (
     AXES,
@@ -31,7 +33,7 @@ from tilestream.factors.virtual_drive import (
     weighted_median,
 )
 from tilestream.factors.virtual_drive import COLUMNS as VIRTUAL
-from tilestream.factors.virtual_scan import Beams, Scene, cast
+from tilestream.factors.virtual_scan import cast
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.grid import Box
 from tilestream.label import localization_error

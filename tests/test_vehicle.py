@@ -12,8 +12,9 @@ from test_virtual_scan import CLEAN, FEW, scene_of, sheet
 
 import tilestream as ts
 from tilestream.errors import UsageError
+from tilestream.factors.beams import Beams
 from tilestream.factors.observability import observability
-from tilestream.factors.virtual_scan import Beams, VirtualScan, look, virtual_scan
+from tilestream.factors.virtual_scan import VirtualScan, look, virtual_scan
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.marks import hash_of
 from tilestream.sensor import Carrier, Mount, Sensor, Vehicle, in_blind_sector, sensor_of

@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 from scenes import PLACES
 
 import tilestream as ts
+from tilestream.factors.beams import Beams
+from tilestream.factors.scene import Scene
 from tilestream.factors.surfels import (
     Surfels,
     surfel_mm,
@@ -18,8 +20,6 @@ from tilestream.factors.surfels import (
     tile_surfels,
 )
 from tilestream.factors.virtual_scan import (
-    Beams,
-    Scene,
     VirtualScan,
     look,
     look_past,

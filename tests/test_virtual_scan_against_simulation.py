@@ -7,8 +7,8 @@ import pytest
 
 import tilestream as ts
 from tilestream.factors.observability import whole_places
+from tilestream.factors.scene import Scene
 from tilestream.factors.surfels import surfel_mm, surfels_in
-from tilestream.factors.virtual_scan import Scene
 from tilestream.formats.logs import open_log
 from tilestream.grid import Box
 from tilestream.kernels.virtual_scan import cast

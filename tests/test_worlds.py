@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from test_virtual_scan import FEW, scene_of, sheet
 
 import tilestream as ts
-from tilestream.factors.virtual_scan import Beams, look, scan_in_world, virtual_scan
+from tilestream.factors.beams import Beams
+from tilestream.factors.virtual_scan import look, scan_in_world, virtual_scan
 from tilestream.factors.worlds import Dice, World, kept, passed_by, stopped, world_at
 from tilestream.kernels.boxes import stopped_by
 from tilestream.settings import VirtualSettings

@@ -15,16 +15,16 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from tilestream.errors import RegistrationError, TileNotReadyError, UsageError
+from tilestream.factors.beams import Beams
 from tilestream.factors.hessian import HESSIAN_COLUMNS, hessian_factors, turned_by
+from tilestream.factors.scene import Scene
 from tilestream.factors.seen_from import SURVEY_COLUMNS, survey_factors
 from tilestream.factors.surfels import Surfels, can_be_met, in_view, surfel_mm, surfels_in
 from tilestream.factors.table import NO_GROUND, places_of
 from tilestream.factors.virtual_drive import COLUMNS as DRIVE_COLUMNS
 from tilestream.factors.virtual_drive import Ends, ends_of, stratified_starts, virtual_drive
 from tilestream.factors.virtual_scan import (
-    Beams,
     Returns,
-    Scene,
     VirtualScan,
     look,
     look_past,

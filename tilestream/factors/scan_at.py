@@ -2,15 +2,10 @@
 
 import numpy as np
 
+from tilestream.factors.beams import Beams
+from tilestream.factors.scene import Scene
 from tilestream.factors.surfels import in_view, surfel_mm, surfels_in
-from tilestream.factors.virtual_scan import (
-    Beams,
-    Scene,
-    look,
-    rotation_of,
-    virtual_scan,
-    whole_places,
-)
+from tilestream.factors.virtual_scan import look, rotation_of, virtual_scan, whole_places
 from tilestream.factors.worlds import passed_by
 from tilestream.grid import MM_PER_M, Box
 from tilestream.kernels.fixed_order import turned

@@ -2,160 +2,28 @@
 4.3).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tilestream.factors.surfels import Surfels
+from tilestream.factors.beams import Beams, SensorBeams
+from tilestream.factors.scene import COLUMN_MM, Scene
 from tilestream.factors.worlds import Dice, kept, stopped, world_at
 from tilestream.grid import MM_PER_M
 from tilestream.kernels.fixed_order import turned
-from tilestream.kernels.surfels import NORMAL_ONE
 from tilestream.kernels.virtual_scan import (
-    BRICK,
     FREE,
-    VOXELS,
-    Bricks,
     Int32,
-    bound_bricks,
     cast,
-    fill_bricks,
     leave_map,
-    mark_bricks,
 )
 from tilestream.records import Float64, Int64
-from tilestream.sensor import Carrier, rim_of
 from tilestream.settings import VirtualSettings
 
-COLUMN_MM = 10_000
-"""Edge of the columns that tell where the map has anything [mm]."""
 NEAR_GROUND, LOW_SHARE, USUAL_HEIGHT = 20.0, 0.2, 2.0
 """The road is taken to be where this share of the returns below the lidar within 20 m lie lower; as
 far below the lidar as usual where there are none [m]."""
-
-
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """The surfels around some places, indexed for ray casting."""
-
-    bricks: Bricks
-    """Index of the surfels by voxel."""
-    mapped: NDArray[np.bool_]
-    """(nx, ny) columns of 10 m that hold any of the map in view."""
-    mapped_corner: Int64
-    """(2,) their lowest corner [mm, map frame]."""
-    column: NDArray[np.intp]
-    """(n,) in which of these columns each surfel lies."""
-
-    @classmethod
-    def of(cls, surfels: Surfels, places_mm: Int64, edge_mm: int) -> "Scene":
-        """The scene of surfels for scans from some places.
-
-        Args:
-            surfels: all that can be seen from the places; at least one.
-            places_mm: (k, 3) the places [mm, map frame], k >= 1.
-            edge_mm: edge of the voxels of the surfels [mm].
-        """
-        size = BRICK * edge_mm
-        low = np.minimum(surfels.centre_mm.min(axis=0), places_mm.min(axis=0))
-        high = np.maximum(surfels.centre_mm.max(axis=0), places_mm.max(axis=0))
-        corner = (low // size - 1) * size
-        shape = (high - corner) // size + 2
-        table = np.zeros((len(surfels), 8), np.float32)
-        table[:, :3] = surfels.centre_mm - corner
-        table[:, 3:6] = surfels.normal / NORMAL_ONE
-        table[:, 6] = surfels.radius_mm
-        grid = np.full(tuple(shape), FREE, np.int32)
-        voxels = np.full((mark_bricks(table, edge_mm, grid), VOXELS), FREE, np.int32)
-        fill_bricks(table, edge_mm, grid, voxels)
-        bounds = bound_bricks(edge_mm, grid, voxels)
-        none = np.zeros(len(surfels), np.bool_)
-        bricks = Bricks(edge_mm, corner, grid, voxels, bounds, table, none)
-        column = surfels.centre_mm[:, :2] // COLUMN_MM
-        mapped_low = column.min(axis=0)
-        in_columns = tuple((column - mapped_low).T)
-        mapped = np.zeros(tuple(column.max(axis=0) - mapped_low + 1), np.bool_)
-        mapped[in_columns] = True
-        flat = np.ravel_multi_index(in_columns, mapped.shape)
-        return cls(bricks, mapped, mapped_low * COLUMN_MM, flat)
-
-    def seen_from(self, in_view: NDArray[np.bool_]) -> "Scene":
-        """The same scene for a place that has only some of its surfels (n,) in view: what is mapped
-        there must not depend on the other places.
-        """
-        mapped = np.zeros_like(self.mapped)
-        mapped.flat[self.column[in_view]] = True
-        return replace(self, mapped=mapped)
-
-    def without(self, gone: NDArray[np.bool_]) -> "Scene":
-        """The same scene, some of its surfels (n,) left out."""
-        return replace(self, bricks=self.bricks._replace(gone=gone))
-
-
-@dataclass(frozen=True, eq=False)
-class SensorBeams:
-    """The beams of one turn of a sensor of a vehicle, outside the vehicle's blind sector."""
-
-    direction: Float64
-    """(n, 3) unit vectors in the frame of the vehicle: x ahead, y left, z up; firing by firing,
-    counter-clockwise from ahead of the sensor, each from the lowest beam to the highest."""
-    origin: Float64
-    """(3,) where the sensor is in that frame [m]."""
-    range_max: float
-    """Usable range [m]."""
-    range_noise: float
-    """Standard deviation of a range [m]."""
-    ring: Int64
-    """(n,) number of the beam, 0 the lowest."""
-    phase: Float64
-    """(n,) when it fires, from -0.5 to 0.5 of a turn; 0 ahead."""
-    turn_s: float
-    """Duration of a turn [s]."""
-
-
-@dataclass(frozen=True, eq=False)
-class Beams:
-    """All beams of one turn of a vehicle's sensors."""
-
-    sensors: tuple[SensorBeams, ...]
-    """Those of each sensor."""
-    range_max: float
-    """Largest usable range [m]."""
-    rim: float
-    """How far from the vehicle's origin a sensor is at most [m]."""
-
-    @classmethod
-    def of(cls, vehicle: Carrier, seeing: VirtualSettings) -> "Beams":
-        """The beams of a vehicle, without its blind sector."""
-        sensors = []
-        for sensor in vehicle.sensors:
-            rays = sensor.rays()
-            seen = sensor.fires(rays, seeing.blind_rear_deg)
-            firing, ring = np.nonzero(seen)
-            phase = firing / len(rays)
-            reach = sensor.range_max if seeing.range_max is None else seeing.range_max
-            sensors.append(
-                SensorBeams(
-                    sensor.in_base(rays[seen]),
-                    sensor.mount.T_base_lidar[:3, 3],
-                    min(reach, sensor.range_max),
-                    sensor.range_noise,
-                    ring,
-                    phase - np.rint(phase),
-                    1.0 / sensor.rate_hz,
-                )
-            )
-        reach = max(sensor.range_max for sensor in sensors)
-        return cls(tuple(sensors), reach, rim_of(vehicle))
-
-    @property
-    def direction(self) -> Float64:
-        """(n, 3) unit vectors in the frame of the vehicle, sensor by sensor."""
-        return np.concatenate([sensor.direction for sensor in self.sensors])
-
-    def __len__(self) -> int:
-        return sum(len(sensor.direction) for sensor in self.sensors)
 
 
 @dataclass(frozen=True, eq=False)
