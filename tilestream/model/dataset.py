@@ -259,9 +259,7 @@ def made_with(columns: Sequence[Column], sensor: Sensor, cell_size: float) -> di
     }
 
 
-def _one_identity(
-    data_sets: Mapping[str, Mapping[str, Any]], may_differ: Sequence[str] = ()
-) -> None:
+def _one_identity(data_sets: Mapping[str, Mapping[str, Any]], may_differ: Sequence[str]) -> None:
     """Refuse labels of different making.
 
     Raises:

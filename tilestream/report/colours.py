@@ -75,7 +75,7 @@ class Scale:
         levels = to_rgb([*self.colours, MISSING])
         return (255.0 * levels[self.step(error)]).round().astype(np.uint8)
 
-    def mappable(self, per_metre: float = 1.0) -> ScalarMappable:
+    def mappable(self, per_metre: float) -> ScalarMappable:
         """For a colour bar of matplotlib, in units of which so many are a metre."""
         edges = [edge * per_metre for edge in self.edges]
         norm = BoundaryNorm(edges, len(self.colours), extend="both")

@@ -133,7 +133,7 @@ def free_space(footprints: Footprints, cell: float = 0.5) -> FreeSpace:
     return FreeSpace((float(low[0]), float(low[1])), cell, np.asarray(distance, np.float32))
 
 
-def route_between(space: FreeSpace, waypoints: Float64, points: int | None = None) -> Float64:
+def route_between(space: FreeSpace, waypoints: Float64, points: int | None) -> Float64:
     """A smooth route through waypoints that keeps clear of buildings, sampled every metre.
 
     Args:

@@ -114,8 +114,8 @@ def read_sources(
     url: str | os.PathLike[str],
     settings: IngestSettings,
     memory: int,
-    log_options: LogOptions | None = None,
-    scans: ScanSelection | None = None,
+    log_options: LogOptions | None,
+    scans: ScanSelection | None,
 ) -> Reading:
     """What `ingest` begins with; arguments and errors as there."""
     found = within(examine_all(sources, settings, log_options, scans), memory)

@@ -260,7 +260,7 @@ def drive_overlap(
     scans: ScanSelection,
     spacing: float,
     sources: Iterable[Mapping[str, Any]],
-    per_point: int = 1,
+    per_point: int,
 ) -> Overlap:
     """What the scans of a drive that are localized share with the sources of a map.
 

@@ -105,9 +105,9 @@ def factors_task(
     samples: Samples,
     looking: Looking,
     folder: str,
-    group: str = "",
-    applies: Stage = factors,
-    own: Sequence[OwnFactors] = (),
+    group: str,
+    applies: Stage,
+    own: Sequence[OwnFactors],
 ) -> Task:
     """The factors of the sample points of a tile, from the terms of the tiles in sight.
 

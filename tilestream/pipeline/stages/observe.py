@@ -98,7 +98,7 @@ def observe_task(
     samples: Samples,
     observing: Observing,
     folder: str,
-    group: str = "",
+    group: str,
     applies: Stage = observe,
     below: str = "",
 ) -> Task:

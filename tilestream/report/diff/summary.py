@@ -12,7 +12,7 @@ from tilestream.report.summary import plain
 from tilestream.version import VERSION
 
 
-def diff_content(found: MapDiff, verdict: Verdict | None = None) -> dict[str, Any]:
+def diff_content(found: MapDiff, verdict: Verdict | None) -> dict[str, Any]:
     """All figures of a comparison; lengths in metres, None for what could not be compared.
 
     Args:
