@@ -9,33 +9,26 @@ import logging
 import math
 import os
 import struct
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import laspy
-import lazrs
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tilestream.crs import Entered, parsed
 from tilestream.errors import CorruptSourceError, UsageError
 from tilestream.files import Files
-from tilestream.formats.base import Block, Bounds, SourceInfo, Span, corner_of
+from tilestream.formats.base import Bounds, SourceInfo, corner_of
 from tilestream.formats.points.las_crs import crs_of
+from tilestream.formats.points.laz_rows import LazRows, chunks_of, laspy_errors
 from tilestream.formats.points.rows import (
     BinaryRows,
     Column,
     Flag,
     RowSource,
     Scaling,
-    finite_block,
-    flagged,
-    steps,
-    whole_span,
 )
 from tilestream.formats.points.written import as_points
 from tilestream.formats.registry import Format
@@ -56,13 +49,6 @@ _SCALE = 0.001
 _INT32 = np.dtype("<i4")
 _XYZ = (Column(0, _INT32), Column(4, _INT32), Column(8, _INT32))
 """X, Y and Z begin every point, whatever its format."""
-_DECODED = lazrs.DecompressionSelection(
-    lazrs.SELECTIVE_DECOMPRESS_XY_RETURNS_CHANNEL
-    | lazrs.SELECTIVE_DECOMPRESS_Z
-    | lazrs.SELECTIVE_DECOMPRESS_CLASSIFICATION
-    | lazrs.SELECTIVE_DECOMPRESS_FLAGS
-)
-"""What is decoded of a LAZ point where its format can be decoded in parts (6 to 10)."""
 _NOISE = (7, 18)
 """Classes of points that are noise: low, and high."""
 _WITHHELD = bytes(bool(value & 0x04) for value in range(256))
@@ -75,79 +61,6 @@ _FLAGS_AT = 15
 """Where that byte is in a point, or the first of the two."""
 _OUTSIDE = 1.0
 """How far the first point may be outside of the header's bounds before they are wrong [m]."""
-_LARGEST_CHUNK = 1 << 28
-"""What a chunk may claim to unpack to [bytes]: 7 million points, and writers choose 50,000."""
-_LAYERED = 3
-"""How such points are packed: each chunk in layers, after its first point, its count and the size
-of each layer."""
-_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
-"""Layers of an item of such a point, by its type; bytes that a user added (14) have one each."""
-
-
-@dataclass(frozen=True)
-class _Chunk:
-    """Compressed points that can be unpacked by themselves."""
-
-    span: Span
-    offset: int
-    packed_bytes: int
-
-
-@dataclass(frozen=True)
-class LazRows:
-    """Compressed points: chunks, one behind the other, that the writer chose the size of."""
-
-    path: str
-    """The file."""
-    count: int
-    """Number of points that the header claims."""
-    scaling: Scaling
-    """How the stored numbers become metres."""
-    chunks: tuple[_Chunk, ...]
-    """The pieces that are unpacked by themselves."""
-    packing: bytes
-    """How lazrs is told the compression: the record of LAZ in the file's header."""
-    dtype: np.dtype[Any]
-    """Type of an unpacked point."""
-    flags: tuple[Flag, ...]
-    """What leaves points out."""
-
-    def spans(self, points: int) -> list[Span]:
-        """Whole chunks, at least one each."""
-        spans, start = [], 0
-        for stop in (chunk.span.stop for chunk in self.chunks):
-            if stop - start >= points or stop == self.count:
-                spans.append(Span(start, stop))
-                start = stop
-        return spans
-
-    def blocks(self, span: Span, block_points: int) -> Iterator[Block]:
-        """The points of a span; see `PointSource.blocks`."""
-        whole_span(span, self.count, self.path)
-        with Path(self.path).open("rb") as file:
-            for chunk in self.chunks:
-                start, stop = max(span.start, chunk.span.start), min(span.stop, chunk.span.stop)
-                if start >= stop:
-                    continue
-                points = self._unpack(file, chunk)
-                rows = points.view(np.uint8).reshape(len(points), self.dtype.itemsize)
-                for step in steps(Span(start, stop), block_points):
-                    part = slice(step.start - chunk.span.start, step.stop - chunk.span.start)
-                    x, y, z = (points[name][part] for name in "XYZ")
-                    yield finite_block(x, y, z, self.scaling, flagged(rows[part], self.flags))
-
-    def _unpack(self, file: BinaryIO, chunk: _Chunk) -> NDArray[Any]:
-        """A chunk by itself: lazrs' own seek goes astray where chunks differ in size (COPC)."""
-        file.seek(chunk.offset)
-        packed = file.read(chunk.packed_bytes)
-        count = chunk.span.stop - chunk.span.start
-        points = np.zeros(count, self.dtype)
-        with _laspy_errors(self.path, f"points {chunk.span.start} to {chunk.span.stop - 1}"):
-            _check_layers(packed, self.packing, self.dtype.itemsize)
-            lazrs.decompress_points_with_chunk_table(
-                packed, self.packing, points.view(np.uint8), [(count, len(packed))], _DECODED
-            )
-        return points
 
 
 def open_las(path: str, *, keep_noise: bool = False) -> RowSource:
@@ -166,7 +79,7 @@ def open_las(path: str, *, keep_noise: bool = False) -> RowSource:
         size_bytes = os.fstat(file.fileno()).st_size
         points_at, point_bytes, count = _checked_header(file, size_bytes, path)
         file.seek(0)
-        with _laspy_errors(path, "header"):
+        with laspy_errors(path, "header"):
             header = laspy.LasHeader.read_from(file, read_evlrs=True)
             dimensions = list(header.point_format.dimensions)
             dtype = header.point_format.dtype()
@@ -177,9 +90,9 @@ def open_las(path: str, *, keep_noise: bool = False) -> RowSource:
         rows: BinaryRows | LazRows = plain
         resident, first_at = 0, points_at
         if header.are_points_compressed:
-            with _laspy_errors(path, "LAZ record"):
+            with laspy_errors(path, "LAZ record"):
                 packing = bytes(header.vlrs[header.vlrs.index("LasZipVlr")].record_data)
-            chunks = _chunks(file, packing, plain, size_bytes)
+            chunks = chunks_of(file, packing, plain, size_bytes)
             rows = LazRows(path, count, scaling, chunks, packing, dtype, flags)
             first_at = chunks[0].offset if chunks else points_at
             sizes = (c.packed_bytes + point_bytes * (c.span.stop - c.span.start) for c in chunks)
@@ -211,20 +124,6 @@ FORMAT = Format(
     magic=b"LASF",
     options=("keep_noise",),
 )
-
-
-@contextmanager
-def _laspy_errors(path: str, where: str) -> Iterator[None]:
-    """Whatever laspy and lazrs raise on damaged bytes, a panic of lazrs included, by our name."""
-    try:
-        yield
-    except (KeyboardInterrupt, SystemExit, GeneratorExit, MemoryError):
-        raise
-    except BaseException as error:
-        raise CorruptSourceError(
-            f"{path}: damaged or cut short in its {where}: {error}; copy it again from where it "
-            "came from"
-        ) from error
 
 
 def _checked_header(file: BinaryIO, size_bytes: int, path: str) -> tuple[int, int, int]:
@@ -298,68 +197,6 @@ def _scaling(header: laspy.LasHeader, crs: Entered, path: str) -> Scaling:
         )
     scale, offset = ((edge * _metres(crs)).tolist() for edge in (header.scales, header.offsets))
     return Scaling(tuple(scale), tuple(offset))
-
-
-def _chunks(
-    file: BinaryIO, packing: bytes, rows: BinaryRows, size_bytes: int
-) -> tuple[_Chunk, ...]:
-    """Where each chunk lies; the table's claims are checked before lazrs allocates by them."""
-    if not rows.count:
-        return ()
-    file.seek(rows.offset)
-    table_at = int.from_bytes(file.read(8), "little", signed=True)
-    if table_at == -1:  # written to a stream: the offset stands at the end of the file
-        file.seek(size_bytes - 8)
-        table_at = int.from_bytes(file.read(8), "little", signed=True)
-    if not rows.offset + 8 <= table_at <= size_bytes - 8:
-        raise CorruptSourceError(
-            f"{rows.path}: its table of compressed chunks is at offset {table_at}, the file ends "
-            f"at {size_bytes}: it is cut short or damaged"
-        )
-    file.seek(table_at + 4)
-    claimed = int.from_bytes(file.read(4), "little")
-    if (claimed - 1) * rows.size > table_at - rows.offset - 8:  # each begins with a whole point
-        raise CorruptSourceError(
-            f"{rows.path}: claims {claimed} chunks at offset {table_at}, more than the "
-            f"{table_at - rows.offset} bytes before it hold: it is damaged"
-        )
-    with _laspy_errors(rows.path, f"table of chunks at offset {table_at}"):
-        vlr = lazrs.LazVlr(packing)
-        if vlr.item_size() != rows.size:
-            raise ValueError(f"its chunks hold points of {vlr.item_size()} bytes, not {rows.size}")
-        file.seek(rows.offset)
-        table: list[tuple[int, int]] = lazrs.read_chunk_table(file, vlr)
-    points, packed = (sum(column) for column in zip(*table, strict=True)) if table else (0, 0)
-    # the last chunk of equal ones may be filled in part, or not at all
-    spare = 0 if vlr.uses_variable_size_chunks() else vlr.chunk_size()
-    if not points - spare <= rows.count <= points or rows.offset + 8 + packed > table_at:
-        raise CorruptSourceError(
-            f"{rows.path}: its header claims {rows.count} points, its {len(table)} chunks hold "
-            f"{points} in {packed} bytes before offset {table_at}: it is damaged"
-        )
-    chunks, start, offset = [], 0, rows.offset + 8
-    for count, packed_bytes in table:
-        span = Span(start, min(start + count, rows.count))
-        if (span.stop - span.start) * rows.size > _LARGEST_CHUNK:
-            raise CorruptSourceError(
-                f"{rows.path}: claims {span.stop - span.start} points in a chunk of {packed_bytes} "
-                f"bytes at offset {offset}, more than {_LARGEST_CHUNK} bytes of them: it is damaged"
-            )
-        if span.start < span.stop:
-            chunks.append(_Chunk(span, offset, packed_bytes))
-        start, offset = span.stop, offset + packed_bytes
-    return tuple(chunks)
-
-
-def _check_layers(packed: bytes, packing: bytes, point_bytes: int) -> None:
-    """Refuse a chunk whose layers claim more than it has: lazrs would end the process."""
-    compressor, items = struct.unpack_from("<H30xH", packing)
-    if compressor == _LAYERED:
-        kinds = struct.iter_unpack("<HH2x", packing[34 : 34 + 6 * items])
-        layers = sum(_LAYERS.get(kind, size) for kind, size in kinds)
-        sizes = np.frombuffer(packed, "<u4", layers, point_bytes + 4)
-        if sizes.sum(dtype=np.uint64) > len(packed):
-            raise ValueError(f"its layers claim {sizes.tolist()} of {len(packed)} bytes")
 
 
 def write_las(path: str | os.PathLike[str], points: ArrayLike, *, crs: str | None = None) -> None:

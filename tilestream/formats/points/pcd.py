@@ -6,12 +6,10 @@ the compression of the third encoding: it is a kernel (`kernels/lzf.py`).
 """
 
 import os
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import accumulate
 from pathlib import Path
-from typing import Any, BinaryIO, Literal
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,41 +17,30 @@ from numpy.typing import ArrayLike, NDArray
 from tilestream.errors import CorruptSourceError, UsageError
 from tilestream.files import Files
 from tilestream.formats.base import Block, SourceInfo, Span
+from tilestream.formats.points.pcd_header import (
+    Encoding,
+    Layout,
+    encoding_of,
+    looks_like_pcd,
+    read_header,
+)
 from tilestream.formats.points.rows import (
     BinaryRows,
     Columns,
     RowSource,
-    TextRows,
-    columns_of,
     even_spans,
     finite_block,
     steps,
     whole_span,
 )
+from tilestream.formats.points.text_rows import TextRows
 from tilestream.formats.points.written import as_points, as_text, table_of
 from tilestream.formats.projector import crs_beside
 from tilestream.formats.registry import Format
 from tilestream.kernels import lzf
 
-_KEYWORDS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS")
-_HEADER_MAX = 1 << 16
-"""Longest header that is read [bytes]."""
-_SIZES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
 _TWO_SIZES = np.dtype("<u4")
 """Compressed and uncompressed size stand before the data of binary_compressed [bytes]."""
-
-Encoding = Literal["ascii", "binary", "binary_compressed"]
-
-
-def looks_like_pcd(head: bytes) -> bool:
-    """Whether the first bytes of a file are those of a PCD header."""
-    for line in head.splitlines():
-        word = line.split(maxsplit=1)[:1]
-        if word and not word[0].startswith(b"#"):
-            return word[0].decode("ascii", "replace") in _KEYWORDS
-        if line.startswith(b"# .PCD"):
-            return True
-    return False
 
 
 @dataclass(frozen=True)
@@ -115,10 +102,10 @@ def open_pcd(path: str) -> RowSource:
             does not have or has no x, y, z; or the file is too short for what it claims.
     """
     with Path(path).open("rb") as file:
-        header, offset = _read_header(file, path)
+        header, offset = read_header(file, path)
         size_bytes = os.fstat(file.fileno()).st_size
-        encoding = _encoding(header, path)
-        layout = _Layout(header, path)
+        encoding = encoding_of(header, path)
+        layout = Layout(header, path)
         rows = _rows(file, encoding, layout, offset, size_bytes, path)
     resident, end = 0, size_bytes
     if isinstance(rows, CompressedRows):
@@ -142,7 +129,7 @@ def open_pcd(path: str) -> RowSource:
 
 
 def _rows(
-    file: BinaryIO, encoding: Encoding, layout: "_Layout", offset: int, size_bytes: int, path: str
+    file: BinaryIO, encoding: Encoding, layout: Layout, offset: int, size_bytes: int, path: str
 ) -> BinaryRows | TextRows | CompressedRows:
     """Where the points lie, within the size of the file."""
     if encoding == "binary_compressed":
@@ -170,121 +157,8 @@ FORMAT = Format(
 )
 
 
-def _read_header(file: BinaryIO, path: str) -> tuple[dict[str, list[str]], int]:
-    """The words behind each keyword, and where the data starts."""
-    header: dict[str, list[str]] = {}
-    while file.tell() < _HEADER_MAX:
-        line = file.readline(_HEADER_MAX)
-        words = line.decode("ascii", "replace").split()
-        if not line.endswith(b"\n"):
-            break
-        if not words or words[0].startswith("#"):
-            continue
-        keyword = "FIELDS" if words[0] == "COLUMNS" else words[0]
-        if keyword not in (*_KEYWORDS, "DATA"):
-            raise CorruptSourceError(
-                f"{path}: unknown keyword {keyword[:40]!r} in its PCD header at offset "
-                f"{file.tell() - len(line)}"
-            )
-        if keyword in header:
-            raise CorruptSourceError(f"{path}: its PCD header has {keyword} twice")
-        header[keyword] = words[1:]
-        if keyword == "DATA":
-            return header, file.tell()
-    raise CorruptSourceError(
-        f"{path}: its PCD header has no whole DATA line up to offset {file.tell()}: the file is "
-        "cut short or damaged; copy it again from where it came from"
-    )
-
-
-def _encoding(header: dict[str, list[str]], path: str) -> Encoding:
-    match header["DATA"]:
-        case [("ascii" | "binary" | "binary_compressed") as encoding]:
-            return encoding
-    raise CorruptSourceError(
-        f"{path}: DATA {' '.join(header['DATA'])!r} in its PCD header: only ascii, binary and "
-        "binary_compressed exist"
-    )
-
-
-class _Layout:
-    """What the header says about a row: fields, types, size, number of rows."""
-
-    def __init__(self, header: dict[str, list[str]], path: str) -> None:
-        self._header, self._path = header, path
-        names = self._words("FIELDS")
-        sizes = self._numbers("SIZE", len(names))
-        kinds = self._words("TYPE", len(names))
-        counts = self._numbers("COUNT", len(names)) if "COUNT" in header else [1] * len(names)
-        types = [self._type(*field) for field in zip(names, kinds, sizes, strict=True)]
-        self.size = sum(t.itemsize * n for t, n in zip(types, counts, strict=True))
-        self.words = sum(counts)
-        self.fields = tuple(
-            (name, t.name if n == 1 else f"{t.name}[{n}]")
-            for name, t, n in zip(names, types, counts, strict=True)
-        )
-        self.columns = self._columns(names, types, counts, [t.itemsize for t in types])
-        self.text_columns = self._columns(names, types, counts, [1] * len(types))
-        self.count = self._points()
-
-    def _words(self, keyword: str, count: int | None = None) -> list[str]:
-        words = self._header.get(keyword)
-        if not words:
-            raise CorruptSourceError(f"{self._path}: its PCD header has no {keyword}")
-        if count is not None and len(words) != count:
-            raise CorruptSourceError(
-                f"{self._path}: {keyword} in its PCD header has {len(words)} values for {count} "
-                "FIELDS"
-            )
-        return words
-
-    def _numbers(self, keyword: str, count: int) -> list[int]:
-        words = self._words(keyword, count)
-        for word in words:
-            if not re.fullmatch(r"[0-9]{1,18}", word):
-                raise CorruptSourceError(
-                    f"{self._path}: {keyword} {word[:40]!r} in its PCD header is no whole number"
-                )
-        return [int(word) for word in words]
-
-    def _type(self, name: str, kind: str, size: int) -> np.dtype[Any]:
-        if size not in _SIZES.get(kind, ()):
-            raise CorruptSourceError(
-                f"{self._path}: field {name!r} has the unknown type TYPE {kind} SIZE {size}; PCD "
-                "has F of 4 and 8 bytes, I and U of 1, 2, 4 and 8"
-            )
-        return np.dtype(f"<{kind.lower()}{size}")
-
-    def _columns(
-        self, names: list[str], types: list[np.dtype[Any]], counts: list[int], widths: list[int]
-    ) -> Columns:
-        many = [name for name, n in zip(names, counts, strict=True) if n != 1 and name in "xyz"]
-        if many:
-            raise CorruptSourceError(
-                f"{self._path}: field {many[0]!r} has COUNT {counts[names.index(many[0])]}; a "
-                "coordinate has 1"
-            )
-        ends = accumulate(width * n for width, n in zip(widths, counts, strict=True))
-        return columns_of(names, [0, *ends], types, self._path)
-
-    def _points(self) -> int:
-        """POINTS, or WIDTH x HEIGHT where an old file lacks it; both must agree."""
-        claims = [self._numbers("POINTS", 1)[0]] if "POINTS" in self._header else []
-        if "WIDTH" in self._header:
-            height = self._numbers("HEIGHT", 1)[0] if "HEIGHT" in self._header else 1
-            claims.append(self._numbers("WIDTH", 1)[0] * height)
-        if not claims:
-            raise CorruptSourceError(f"{self._path}: its PCD header has no POINTS")
-        if len(set(claims)) > 1:
-            raise CorruptSourceError(
-                f"{self._path}: POINTS {claims[0]} in its PCD header is not WIDTH x HEIGHT = "
-                f"{claims[1]}"
-            )
-        return claims[0]
-
-
 def _compressed_sizes(
-    sizes: NDArray[np.uint8], layout: _Layout, offset: int, size_bytes: int, path: str
+    sizes: NDArray[np.uint8], layout: Layout, offset: int, size_bytes: int, path: str
 ) -> tuple[int, int]:
     """Bytes before and after decoding, checked before anything of that size is allocated."""
     data = offset + 2 * _TWO_SIZES.itemsize

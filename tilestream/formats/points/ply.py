@@ -21,7 +21,8 @@ import numpy as np
 from tilestream.errors import CorruptSourceError
 from tilestream.formats.base import SourceInfo
 from tilestream.formats.points.ply_lists import Element, ListRows, ListTextRows, Property
-from tilestream.formats.points.rows import BinaryRows, RowSource, TextRows, columns_of
+from tilestream.formats.points.rows import BinaryRows, RowSource, columns_of
+from tilestream.formats.points.text_rows import TextRows
 from tilestream.formats.registry import Format
 
 _HEADER_MAX = 1 << 20

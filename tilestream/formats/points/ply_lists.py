@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from tilestream.errors import CorruptSourceError
 from tilestream.formats.base import Block, Span
-from tilestream.formats.points.rows import TextRows, even_spans, finite_block, steps, whole_span
+from tilestream.formats.points.rows import even_spans, finite_block, steps, whole_span
+from tilestream.formats.points.text_rows import TextRows
 from tilestream.kernels.list_rows import CUT_SHORT, find_rows
 
 
