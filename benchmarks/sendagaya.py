@@ -33,7 +33,8 @@ import numpy as np
 
 from tilestream.simulation.city import MARGIN
 from tilestream.simulation.footprints import read_footprints
-from tilestream.simulation.streets import Street, check_clear, clearance, free_space, route_between
+from tilestream.simulation.free_space import clearance, free_space, route_between
+from tilestream.simulation.streets import Street, check_clear
 
 ROUTES = (
     ("avenue", "a street of two lanes", 420,

@@ -30,7 +30,8 @@ import numpy as np
 
 import tilestream
 from tilestream.simulation.footprints import read_footprints
-from tilestream.simulation.streets import Street, check_clear, clearance, free_space, route_between
+from tilestream.simulation.free_space import clearance, free_space, route_between
+from tilestream.simulation.streets import Street, check_clear
 
 DATA = Path(tilestream.__file__).parent / "data"
 ROUTES = (

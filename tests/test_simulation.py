@@ -18,20 +18,18 @@ from tilestream.errors import (
 from tilestream.pipeline.jobs.simulate import require_space
 from tilestream.sensor import VLP16
 from tilestream.simulation.footprints import Footprints, read_footprints
+from tilestream.simulation.free_space import (
+    MIN_CLEARANCE,
+    clearance,
+    free_space,
+    resample,
+    route_between,
+)
 from tilestream.simulation.lidar import measure, turn_of
 from tilestream.simulation.mesh import Material, boxes, joined, walls
 from tilestream.simulation.raycast import Embree, Open3D, Scene
 from tilestream.simulation.settings import LidarSettings, load_preset, stream
-from tilestream.simulation.streets import (
-    MIN_CLEARANCE,
-    Street,
-    check_clear,
-    clearance,
-    free_space,
-    read_streets,
-    resample,
-    route_between,
-)
+from tilestream.simulation.streets import Street, check_clear, read_streets
 
 DATA = Path(load_preset.__code__.co_filename).parents[1] / "data"
 EXACT = LidarSettings(

@@ -15,15 +15,11 @@ import numpy as np
 from tilestream.records import Float64
 from tilestream.simulation import buildings, furniture, structures
 from tilestream.simulation.footprints import Footprints, read_footprints
+from tilestream.simulation.free_space import free_space
 from tilestream.simulation.ground import Ground
 from tilestream.simulation.mesh import Mesh, joined
 from tilestream.simulation.settings import SimulationSettings
-from tilestream.simulation.streets import (
-    Street,
-    free_space,
-    read_streets,
-    street_called,
-)
+from tilestream.simulation.streets import Street, read_streets, street_called
 
 REACH = 115.0
 """How far around a stretch the city is built [m]: a lidar's range and some more."""

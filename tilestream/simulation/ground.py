@@ -7,9 +7,10 @@ import numpy as np
 from scipy import ndimage
 
 from tilestream.records import Float64
+from tilestream.simulation.free_space import FreeSpace
 from tilestream.simulation.mesh import Material, Mesh, joined, quads
 from tilestream.simulation.settings import SimulationSettings, stream
-from tilestream.simulation.streets import FreeSpace, Street
+from tilestream.simulation.streets import Street
 
 CURB = 0.15
 """Height of a pavement above the road [m]."""
