@@ -36,6 +36,7 @@ from tilestream.notebook import html_of
 from tilestream.pipeline.jobs.run_book import ENDED, content_as_written
 from tilestream.pipeline.jobs.run_folder import map_of, rows_of, table_paths
 from tilestream.pipeline.jobs.run_inputs import seen_otherwise
+from tilestream.pipeline.jobs.run_names import CONFIG
 from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.jobs.run_state import record_of
 from tilestream.report.data import interpolated
@@ -187,7 +188,7 @@ def settings_of(place: str | os.PathLike[str]) -> RunSettings | None:
     Raises:
         UsageError: they are of no job of this version.
     """
-    config = Files.at(place).under("config.yaml")
+    config = Files.at(place).under(CONFIG)
     if not config.there():
         return None
     with foreign_errors(UsageError, f"{config.address}: no job", "give a run directory of ours"):

@@ -50,7 +50,7 @@ from tilestream.pipeline.jobs.run_inputs import (
     inputs_of,
 )
 from tilestream.pipeline.jobs.run_lanes import lanelet_maps_of
-from tilestream.pipeline.jobs.run_names import RECORD
+from tilestream.pipeline.jobs.run_names import CONFIG, DATASET, RECORD
 from tilestream.pipeline.jobs.run_notes import (
     drives_measured,
     heights_told,
@@ -189,13 +189,13 @@ def dataset(run_dir: str | os.PathLike[str]) -> pd.DataFrame:
 
 def dataset_of(run_dir: str | os.PathLike[str]) -> Dataset:
     """The same with all that is known of it; raises as `dataset`."""
-    return DatasetFile(f"{place_of(run_dir)}/tables/samples/dataset.parquet").read()
+    return DatasetFile(f"{place_of(run_dir)}/{DATASET}").read()
 
 
 def _begin(settings: RunSettings) -> Book:
     """The run directory with the effective settings."""
     text = yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
-    settings.folder.under("config.yaml").write(text.encode())
+    settings.folder.under(CONFIG).write(text.encode())
     return Book(settings.folder, told_before(settings.folder.under(RECORD)))
 
 

@@ -21,7 +21,7 @@ from tilestream.marks import AGAIN, sealed, unsealed
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.engine.stage import Task
-from tilestream.pipeline.jobs.run_names import RECORD
+from tilestream.pipeline.jobs.run_names import CONFIG, RECORD
 from tilestream.version import VERSION
 
 ENDED = ("done", "failed")
@@ -139,7 +139,7 @@ def told_before(record: Files) -> dict[str, Any]:
 
 def checksums(folder: Files) -> dict[str, str]:
     """The checksums of what a run writes besides its tables, by path in the run directory."""
-    names = ["config.yaml", "model.skops", "tables/evaluation.json"]
+    names = [CONFIG, "model.skops", "tables/evaluation.json"]
     for below in ("report", "before"):
         names += [f"{below}/{name}" for name in folder.under(below).all_files()]
     return {name: checksum_of(folder.under(name)) for name in names if folder.under(name).there()}

@@ -17,6 +17,7 @@ from tilestream.errors import (
 )
 from tilestream.files import Files
 from tilestream.pipeline.jobs.inventory import tables_in
+from tilestream.pipeline.jobs.run_names import CONFIG
 from tilestream.pipeline.jobs.run_state import record_of
 from tilestream.store import TileStore, open_store
 from tilestream.tables import read_mark, read_tables
@@ -103,7 +104,7 @@ def job_of(run_dir: Files) -> Mapping[str, Any]:
     Raises:
         DamagedError: they are not what was written.
     """
-    file = run_dir.under("config.yaml")
+    file = run_dir.under(CONFIG)
     try:
         text = file.read().decode("utf-8", "replace")
     except (FileNotFoundError, NotADirectoryError):

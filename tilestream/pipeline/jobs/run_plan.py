@@ -31,6 +31,7 @@ from tilestream.pipeline.jobs.run_inputs import (
     observing_of,
     reading_of,
 )
+from tilestream.pipeline.jobs.run_names import DATASET
 from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.jobs.sources import scans_of
 from tilestream.pipeline.stages.between import Between
@@ -230,7 +231,7 @@ def _samples(
     return Task(
         samples,
         "dataset",
-        DatasetFile(f"{settings.out}/tables/samples/dataset.parquet"),
+        DatasetFile(f"{settings.out}/{DATASET}"),
         takes={
             "groups": {name: tuple(map(_group, tasks)) for name, tasks in parts.items()},
             "making": making_of(settings),

@@ -15,6 +15,7 @@ from tilestream.model.over_runs import DISTRICT, Run, over_runs
 from tilestream.model.registry import DEFAULT
 from tilestream.model.training import Model, train
 from tilestream.pipeline.jobs.run_inputs import making_of, observing_drive
+from tilestream.pipeline.jobs.run_names import CONFIG, DATASET
 from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
 from tilestream.pipeline.stages.samples import DatasetFile
 from tilestream.simulation.settings import load_preset
@@ -73,8 +74,8 @@ def _run(of: str | os.PathLike[str] | Dataset, district: str | None) -> Run:
     if isinstance(of, Dataset):
         return Run(of, district or DISTRICT)
     place = place_of(of)
-    measured = DatasetFile(f"{place}/tables/samples/dataset.parquet").read()
-    settings = read_settings(f"{place}/config.yaml")
+    measured = DatasetFile(f"{place}/{DATASET}").read()
+    settings = read_settings(f"{place}/{CONFIG}")
     simulated = settings.simulate
     about: dict[str, Any] = {}
     if simulated is not None:
