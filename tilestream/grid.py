@@ -133,7 +133,11 @@ class TileGrid:
         return cls(whole_mm(tile_size, "tile_size"), whole_mm(halo, "halo"))
 
     def key_at(self, x: float, y: float) -> TileKey:
-        """The tile whose core holds the point (x, y) [m, map frame], rounded to 1 mm."""
+        """The tile whose core holds the point (x, y) [m, map frame], rounded to 1 mm.
+
+        Raises:
+            UsageError: a coordinate is not finite.
+        """
         try:
             x_mm, y_mm = round(x * MM_PER_M), round(y * MM_PER_M)
         except (OverflowError, ValueError):

@@ -237,6 +237,9 @@ def vicinity_sums(places: Float64, sensor: Sensor, tiles: Iterable[TileTerms]) -
         `range_squared` [m^2], `sight_xx` ... `sight_zz` (sums of u u^T, u = (mu - P) / r),
         `azimuth` and `azimuth_standing` (k, 90) cells per azimuth of mu - P, `occupied` and
         `pixels` of the depth image, `loose_points` (map points in voxels that are no cells).
+
+    Raises:
+        UsageError: tiles have terms of two kinds.
     """
     places = np.ascontiguousarray(places, np.float64)
     k, reach = len(places), float(sensor.range_max)

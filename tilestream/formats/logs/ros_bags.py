@@ -83,7 +83,11 @@ class _RosbagsFile(AbstractContextManager["_RosbagsFile"]):
                 yield Message(connection.topic, place, held, memoryview(data))
 
     def content(self, topic: str, place: Sequence[int]) -> memoryview:
-        """The message of a topic at a place."""
+        """The message of a topic at a place.
+
+        Raises:
+            CorruptSourceError: it is not the one that was there.
+        """
         time, nth, size = place
         with self._errors():
             there = self._reader.messages(self._of({topic}), time, time + 1)

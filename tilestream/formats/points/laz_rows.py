@@ -125,7 +125,17 @@ class LazRows:
 def chunks_of(
     file: BinaryIO, packing: bytes, rows: BinaryRows, size_bytes: int
 ) -> tuple[Chunk, ...]:
-    """Where each chunk lies; the table's claims are checked before lazrs allocates by them."""
+    """Where each chunk lies; the table's claims are checked before lazrs allocates by them.
+
+    Args:
+        file: the file, open.
+        packing: the record of LAZ in its header.
+        rows: the points as they would lie unpacked: where, of what size, how many.
+        size_bytes: size of the file [bytes].
+
+    Raises:
+        CorruptSourceError: the table is not what the header and the file's size allow.
+    """
     if not rows.count:
         return ()
     file.seek(rows.offset)

@@ -100,7 +100,11 @@ class RowSource:
 
 
 def even_spans(count: int, points: int) -> list[Span]:
-    """`count` points in spans of at most `points`, as equal as whole numbers allow."""
+    """`count` points in spans of at most `points`, as equal as whole numbers allow.
+
+    Raises:
+        UsageError: `points` is below 1.
+    """
     if points < 1:
         raise UsageError(f"a span of {points} points: give at least 1")
     pieces = math.ceil(count / points)
@@ -109,7 +113,11 @@ def even_spans(count: int, points: int) -> list[Span]:
 
 
 def steps(span: Span, block_points: int) -> Iterator[Span]:
-    """A span in pieces of `block_points`; the last one takes what is left."""
+    """A span in pieces of `block_points`; the last one takes what is left.
+
+    Raises:
+        UsageError: `block_points` is below 1.
+    """
     if block_points < 1:
         raise UsageError(f"a block of {block_points} points: give at least 1")
     for start in range(span.start, span.stop, block_points):

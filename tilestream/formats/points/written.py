@@ -13,7 +13,11 @@ _FLOAT32_LOSS = 1e-4
 
 
 def as_points(points: ArrayLike) -> Float64:
-    """(n, 3) float64 from what a caller gave to a writer."""
+    """(n, 3) float64 from what a caller gave to a writer.
+
+    Raises:
+        UsageError: another shape.
+    """
     table = np.asarray(points, dtype=np.float64)
     if table.ndim != 2 or table.shape[1] != 3:
         raise UsageError(f"points of shape {table.shape}: give (n, 3)")
@@ -29,7 +33,11 @@ def coordinate_type(points: Float64) -> DTypeLike:
 
 
 def table_of(points: Float64, fields: dict[str, ArrayLike] | None) -> NDArray[Any]:
-    """x, y, z and further fields as one structured array, a row per point."""
+    """x, y, z and further fields as one structured array, a row per point.
+
+    Raises:
+        UsageError: a field that is no number per point, or a name that files cannot have.
+    """
     xyz = np.dtype(coordinate_type(points)).newbyteorder("<")
     further = {name: np.asarray(values) for name, values in (fields or {}).items()}
     for name, values in further.items():

@@ -323,6 +323,9 @@ def slice_tasks(
         folder: of all tables.
         group: which drive, as whose sensor; empty where a job has one only.
         starts_per_task: starts of one task; None: all.
+
+    Raises:
+        UsageError: `starts_per_task` is below 1.
     """
     starts = len(start_poses(np.eye(4), measuring.starts))
     size = starts if starts_per_task is None else starts_per_task
