@@ -280,7 +280,7 @@ def test_a_second_run_redoes_nothing(inputs: Path, copy: Path) -> None:
 @pytest.mark.slow
 def test_another_seed_redoes_the_models_only(inputs: Path, copy: Path) -> None:
     told = Told()
-    ts.run(job(inputs, copy, model={"seed": 7}), watch=told)
+    ts.run(job(inputs, copy, model={"recipe": "forest", "seed": 7}), watch=told)
     assert told.worked() == set(LEARNT) - {"samples"}
 
 
@@ -301,7 +301,8 @@ def test_a_drive_that_is_left_out_leaves_nothing_behind(inputs: Path, copy: Path
     assert set(table["group"]) == {"canyon", "tunnel"}
     pd.testing.assert_frame_equal(table, dataset_of(copy).rows)
     assert table.attrs["features"] == dataset_of(copy).names
-    assert {p.name for p in (copy / "tables" / "errors").iterdir()} == {"canyon", "tunnel"}
+    for kind in ("errors", "starts", "drives"):
+        assert {p.name for p in (copy / "tables" / kind).iterdir()} == {"canyon", "tunnel"}
     places = pd.read_parquet(copy / "report" / "places.parquet")
     assert set(places["route_id"]) == {"canyon", "tunnel"}
 

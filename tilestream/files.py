@@ -284,6 +284,11 @@ class Files:
             except FileNotFoundError:
                 continue
 
+    def remove_empty(self) -> None:
+        """Remove this folder if nothing is in it; in an object store there is none then."""
+        if self.local and Path(self.root).is_dir() and not self.names():
+            Path(self.root).rmdir()
+
     def remove_parts(self) -> None:
         """Remove the half-written files that killed writers have left in this folder."""
         for name in self.names():

@@ -124,8 +124,8 @@ def only_writer(url: str | os.PathLike[str]) -> Iterator[None]:
         renewing.join()
         with suppress(OSError):  # a folder that was removed meanwhile, a disk that is gone
             _free(folder.under(LOCK), me)
-            if made and folder.local and not folder.names():
-                Path(folder.root).rmdir()  # of a job that was refused before it wrote anything
+            if made:
+                folder.remove_empty()  # of a job that was refused before it wrote anything
 
 
 def writer_of(url: str | os.PathLike[str]) -> Holder | None:

@@ -75,12 +75,15 @@ def announce(tasks: Iterable[Task], *, begun: bool = False) -> None:
 
 
 def withdraw(folder: str) -> None:
-    """Remove the tables that a folder's inventory names, then the inventory."""
+    """Remove the tables that a folder's inventory names, the inventory, and the folder if it is
+    empty then.
+    """
     place = Files.at(folder)
     for name in inventory_of(folder):
         place.under(name).remove()
     place.under(INVENTORY).remove()
     place.remove_parts()
+    place.remove_empty()
 
 
 def settle(tasks: Iterable[Task], failures: Mapping[str, str]) -> None:

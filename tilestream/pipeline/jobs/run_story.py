@@ -294,9 +294,10 @@ def _remove_other_groups(settings: RunSettings, measure: Plan) -> None:
         ("drives", "/observability"),
     ):
         for group in Files.at(f"{settings.out}/tables/{kind}").names():
-            folder = f"{settings.out}/tables/{kind}/{group}{below}"
-            if folder not in own and group not in kept:
-                withdraw(folder)
+            folder = f"{settings.out}/tables/{kind}/{group}"
+            if f"{folder}{below}" not in own and group not in kept:
+                withdraw(f"{folder}{below}")
+                Files.at(folder).remove_empty()
 
 
 def _is_large(estimate: Plan) -> bool:
