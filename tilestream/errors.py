@@ -165,6 +165,20 @@ def counted(failures: Mapping[str, str]) -> str:
     return told + (f", {not_run:,} not run" if not_run else "")
 
 
+def require_all_done(job: object, failures: dict[str, str]) -> None:
+    """Refuse a job that has ended with failures.
+
+    Args:
+        job: what it is called, or where it wrote.
+        failures: reasons by name.
+
+    Raises:
+        PartialError: there are some; says how many, and that the rest is done.
+    """
+    if failures:
+        raise PartialError(f"{job}: {counted(failures)}, the rest is done:", failures)
+
+
 def _together(names: list[str], reason: str) -> str:
     """Several names with one reason, on a line."""
     parts = [OF_A_KIND.fullmatch(name) for name in names]

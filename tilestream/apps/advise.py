@@ -12,7 +12,7 @@ import pandas as pd
 from tilestream.apps.choices import choice_tasks, tables_by_choice
 from tilestream.apps.remedies import FIRST_GUESS, remedies_of
 from tilestream.apps.runs import NEEDED, places_of, settings_of, worth_of
-from tilestream.errors import PartialError, SourceNotFoundError, UsageError, counted
+from tilestream.errors import SourceNotFoundError, UsageError, require_all_done
 from tilestream.factors.rows import samples_of_places
 from tilestream.files import Files
 from tilestream.pipeline.engine.executor import Watch
@@ -125,10 +125,7 @@ def advise(
             settings.memory,
         )
         plan = Plan.of((*map_plan.tasks.values(), *tasks), settings.memory)
-        failures = make_tables(plan, folder, client, watch)
-        if failures:
-            told = f"{folder}: {counted(failures)}, the rest is done:"
-            raise PartialError(told, failures)
+        require_all_done(folder, make_tables(plan, folder, client, watch))
         tables = tables_by_choice(plan.outputs(observe.name))
         seen |= {name: read_tables(tables[choice.name]) for name, choice in tried.items()}
     found = _advice(places, poor, looked_at, seen, left_out, threshold)

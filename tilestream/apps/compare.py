@@ -17,7 +17,7 @@ from tilestream.apps.choices import (
     require_sizes,
     tables_by_choice,
 )
-from tilestream.errors import PartialError, counted
+from tilestream.errors import require_all_done
 from tilestream.factors.rows import in_route_order
 from tilestream.grid import MM_PER_M, whole_mm
 from tilestream.matcher import RegistrationSettings
@@ -102,9 +102,7 @@ def compare(
         partial,
     )
     tables = tables_by_choice(plan.outputs(observe.name))
-    failures = make_tables(plan, out, client, watch)
-    if failures:
-        raise PartialError(f"{out}: {counted(failures)}, the rest is done:", failures)
+    require_all_done(out, make_tables(plan, out, client, watch))
     order = [route.route_id for route in routes]
     rows = pd.concat(
         [rows_of(choice, tables[choice.name], order, store) for choice in choices],

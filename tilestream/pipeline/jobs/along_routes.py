@@ -9,7 +9,7 @@ import pandas as pd
 from scipy.spatial import cKDTree
 
 from tilestream.crs import require_same
-from tilestream.errors import PartialError, TileNotReadyError, counted
+from tilestream.errors import TileNotReadyError, require_all_done
 from tilestream.factors.catalogue import Which
 from tilestream.factors.own import OwnFactors
 from tilestream.factors.rows import Samples, in_route_order, samples_by_tile
@@ -302,6 +302,5 @@ def _tables_of(
     failures = {key: reason for key, reason in failed.items() if key in own}
     tables = paths_of(plan.outputs(stage))
     if failures:
-        folder = tables[0].rsplit("/", 1)[0]
-        raise PartialError(f"{folder}: {counted(failures)}, the rest is done:", failures)
+        require_all_done(tables[0].rsplit("/", 1)[0], failures)
     return in_route_order(read_tables(tables), [route.route_id for route in routes])

@@ -9,11 +9,10 @@ from typing import Any
 
 from tilestream.crs import same
 from tilestream.errors import (
-    PartialError,
     SourceError,
     StoreNotFoundError,
     UsageError,
-    counted,
+    require_all_done,
 )
 from tilestream.formats.logs import ScanSelection
 from tilestream.lock import only_writer
@@ -101,11 +100,7 @@ def ingest(
             inputs=reading.inputs,
         )
         failures = reading.close(outcomes)
-    if failures:
-        raise PartialError(
-            f"{reading.store.url}: {counted(failures)}, the rest is done:",
-            failures,
-        )
+    require_all_done(reading.store.url, failures)
     return reading.store
 
 

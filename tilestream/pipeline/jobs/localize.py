@@ -11,11 +11,10 @@ import numpy as np
 import pandas as pd
 
 from tilestream.errors import (
-    PartialError,
     SourceNotFoundError,
     TileNotReadyError,
     UsageError,
-    counted,
+    require_all_done,
 )
 from tilestream.factors.rows import Samples, samples_of_drive
 from tilestream.files import local_path, place_of
@@ -128,9 +127,7 @@ def localize(
         starts_per_task=starts_per_task,
         memory=memory,
     )
-    failures = make_tables(plan, out, client, watch)
-    if failures:
-        raise PartialError(f"{out}: {counted(failures)}, the rest is done:", failures)
+    require_all_done(out, make_tables(plan, out, client, watch))
     return read_tables(paths_of(plan.outputs(label.name)))
 
 

@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 import yaml
 
-from tilestream.errors import PartialError, counted
+from tilestream.errors import require_all_done
 from tilestream.files import place_of
 from tilestream.lock import only_writer
 from tilestream.model.covariance import calibration_told
@@ -157,10 +157,7 @@ def _run(
     for name in ("", "tables", "report", "report/figures", "before"):
         settings.folder.under(name).remove_parts()
     book.write("failed" if book.failures else "done")
-    if book.failures:
-        raise PartialError(
-            f"{settings.out}: {counted(book.failures)}, the rest is done:", book.failures
-        )
+    require_all_done(settings.out, book.failures)
 
 
 def dataset(run_dir: str | os.PathLike[str]) -> pd.DataFrame:

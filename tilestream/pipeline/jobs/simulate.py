@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from tilestream.errors import PartialError, PlanError, UsageError, counted
+from tilestream.errors import PlanError, UsageError, require_all_done
 from tilestream.files import Files, local_path, place_of
 from tilestream.lock import only_writer
 from tilestream.pipeline.engine.executor import Watch, execute
@@ -112,8 +112,7 @@ def simulate(
             Files.at(folder).under(name).remove_parts()
         if not failures:
             shutil.rmtree(folder / "parts", ignore_errors=True)
-    if failures:
-        raise PartialError(f"{folder}: {counted(failures)}, the rest is done:", failures)
+    require_all_done(folder, failures)
     return folder
 
 
