@@ -28,8 +28,9 @@ from tilestream.label import refined_pose, start_errors, start_poses
 from tilestream.marks import Mark
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.jobs.drive_measured import drive_measured
-from tilestream.pipeline.jobs.localize import REACH, choose_samples
+from tilestream.pipeline.jobs.localize import REACH
 from tilestream.pipeline.jobs.run_folder import map_of
+from tilestream.pipeline.jobs.sample_scans import choose_samples
 from tilestream.pipeline.stages.drive_scans import Reading
 from tilestream.pipeline.stages.label import ERROR_COLUMNS
 from tilestream.pipeline.stages.register import START_COLUMNS

@@ -19,8 +19,8 @@ from tilestream.formats.logs import ScanSelection, open_log
 from tilestream.formats.points.pcd import write_pcd
 from tilestream.notes import noticed, shared
 from tilestream.pipeline.jobs.drive_measured import drive_measured
-from tilestream.pipeline.jobs.localize import choose_samples
 from tilestream.pipeline.jobs.run_settings import RunSettings
+from tilestream.pipeline.jobs.sample_scans import choose_samples
 from tilestream.report import gate
 from tilestream.report.drives import DriveMeasured
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pandas as pd
 
 from tilestream.formats.logs import ScanLog, ScanSelection
-from tilestream.pipeline.jobs.localize import choose_samples
+from tilestream.pipeline.jobs.sample_scans import choose_samples
 from tilestream.report.drives import DriveMeasured
 
 NOT_SELECTED = "not selected"
