@@ -9,7 +9,7 @@ import model_data
 
 import tilestream as ts
 from tilestream.model.file import save_model
-from tilestream.pipeline.jobs.run_inputs import making_of
+from tilestream.pipeline.jobs.run_making import making_of
 from tilestream.pipeline.jobs.run_settings import RunSettings
 
 LENGTHS = {"a": 240, "b": 240, "c": 240}

@@ -24,7 +24,8 @@ from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.jobs.estimate import estimate_settings
 from tilestream.pipeline.jobs.forecast import forecast
 from tilestream.pipeline.jobs.inventory import tables_in
-from tilestream.pipeline.jobs.run_inputs import as_far_as_known, inputs_of
+from tilestream.pipeline.jobs.run_inputs import inputs_of
+from tilestream.pipeline.jobs.run_making import as_far_as_known
 from tilestream.pipeline.jobs.run_settings import ModelSettings, RunSettings
 from tilestream.pipeline.stages import observe as observe_stage
 from tilestream.pipeline.stages import samples as samples_stage

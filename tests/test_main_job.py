@@ -53,7 +53,8 @@ from tilestream.pipeline.jobs import run_story
 from tilestream.pipeline.jobs.forecast import forecast
 from tilestream.pipeline.jobs.run import dataset_of
 from tilestream.pipeline.jobs.run_book import Book
-from tilestream.pipeline.jobs.run_inputs import check_model, inputs_of, making_of
+from tilestream.pipeline.jobs.run_inputs import inputs_of
+from tilestream.pipeline.jobs.run_making import check_model, making_of
 from tilestream.pipeline.jobs.run_plan import plan_estimate, plan_measure
 from tilestream.pipeline.jobs.run_settings import ModelSettings, RunSettings, read_settings
 from tilestream.pipeline.stages import predict as predict_stage

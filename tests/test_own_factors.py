@@ -24,7 +24,7 @@ from tilestream.model.training import train
 from tilestream.pipeline.engine.executor import execute
 from tilestream.pipeline.engine.outputs import Made, Stored
 from tilestream.pipeline.jobs.along_routes import plan_factors
-from tilestream.pipeline.jobs.run_inputs import making_of
+from tilestream.pipeline.jobs.run_making import making_of
 from tilestream.pipeline.stages.factors import Looking
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.samples import DatasetFile, samples

@@ -9,7 +9,7 @@ from tilestream.model.dataset import POINTS_MIN, WITHOUT_DRIVES
 from tilestream.model.file import load_model
 from tilestream.model.registry import UNTRAINED
 from tilestream.model.shipped import SHIPPED, file_of, is_shipped
-from tilestream.pipeline.jobs.run_inputs import making_of
+from tilestream.pipeline.jobs.run_making import making_of
 from tilestream.pipeline.jobs.run_settings import RunSettings
 
 LABELS = "labels"

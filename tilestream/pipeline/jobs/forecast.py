@@ -17,9 +17,7 @@ from tilestream.pipeline.jobs.rounds import first_round
 from tilestream.pipeline.jobs.run_before import update_of
 from tilestream.pipeline.jobs.run_inputs import (
     Inputs,
-    as_far_as_known,
     check_files,
-    check_model,
     extent,
     inputs_of,
     is_simulated,
@@ -28,6 +26,7 @@ from tilestream.pipeline.jobs.run_inputs import (
     simulated_folder,
     simulations,
 )
+from tilestream.pipeline.jobs.run_making import as_far_as_known, check_model
 from tilestream.pipeline.jobs.run_notes import with_logs
 from tilestream.pipeline.jobs.run_plan import places_to_train, plan_estimate, plan_measure
 from tilestream.pipeline.jobs.run_settings import RunSettings

@@ -8,7 +8,7 @@ from tilestream.grid import MM_PER_M, TileGrid, TileKey
 from tilestream.pipeline.engine.outputs import Parquet
 from tilestream.pipeline.engine.stage import Readable, Stage, Task
 from tilestream.pipeline.jobs.estimator import Estimator
-from tilestream.pipeline.jobs.run_inputs import making_of
+from tilestream.pipeline.jobs.run_making import making_of
 from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.stages.between import Between
 from tilestream.pipeline.stages.predict import predict

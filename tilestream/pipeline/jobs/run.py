@@ -41,15 +41,9 @@ from tilestream.pipeline.jobs.run_book import (
 )
 from tilestream.pipeline.jobs.run_done import Done, without
 from tilestream.pipeline.jobs.run_findings import findings_of
-from tilestream.pipeline.jobs.run_inputs import (
-    JOB,
-    Inputs,
-    as_far_as_known,
-    check_files,
-    check_model,
-    inputs_of,
-)
+from tilestream.pipeline.jobs.run_inputs import JOB, Inputs, check_files, inputs_of
 from tilestream.pipeline.jobs.run_lanes import lanelet_maps_of
+from tilestream.pipeline.jobs.run_making import as_far_as_known, check_model
 from tilestream.pipeline.jobs.run_names import CONFIG, DATASET, RECORD
 from tilestream.pipeline.jobs.run_notes import (
     drives_measured,

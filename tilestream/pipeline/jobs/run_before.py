@@ -20,7 +20,7 @@ from tilestream.grid import TileKey
 from tilestream.marks import AGAIN, hash_of, sealed, unsealed
 from tilestream.pipeline.jobs.map_update import Update
 from tilestream.pipeline.jobs.run_book import checksum_of
-from tilestream.pipeline.jobs.run_inputs import making_of
+from tilestream.pipeline.jobs.run_making import making_of
 from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.jobs.run_state import record_of
 from tilestream.pipeline.stages.map_plan import MapPlan

@@ -24,13 +24,8 @@ from tilestream.pipeline.jobs.along_routes import plan_factors, plan_observe, sa
 from tilestream.pipeline.jobs.estimator import NONE_ASIDE, Estimator, estimator_of
 from tilestream.pipeline.jobs.localize import labelled_places, plan_localize
 from tilestream.pipeline.jobs.prediction_tasks import model_there, prediction_tasks, products
-from tilestream.pipeline.jobs.run_inputs import (
-    Inputs,
-    making_of,
-    observing_drive,
-    observing_of,
-    reading_of,
-)
+from tilestream.pipeline.jobs.run_inputs import Inputs, observing_drive, observing_of, reading_of
+from tilestream.pipeline.jobs.run_making import making_of
 from tilestream.pipeline.jobs.run_names import DATASET
 from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.jobs.sources import scans_of

@@ -14,7 +14,8 @@ from tilestream.model.file import save_model
 from tilestream.model.over_runs import DISTRICT, Run, over_runs
 from tilestream.model.registry import DEFAULT
 from tilestream.model.training import Model, train
-from tilestream.pipeline.jobs.run_inputs import making_of, observing_drive
+from tilestream.pipeline.jobs.run_inputs import observing_drive
+from tilestream.pipeline.jobs.run_making import making_of
 from tilestream.pipeline.jobs.run_names import CONFIG, DATASET
 from tilestream.pipeline.jobs.run_settings import RunSettings, read_settings
 from tilestream.pipeline.stages.samples import DatasetFile
