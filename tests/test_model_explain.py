@@ -195,7 +195,7 @@ def test_without_training_reasons_rest_on_fixed_bounds() -> None:
         ],
         [
             "a virtual drive rises or sinks (19 cm)",
-            "much of the view is not in the map (25 %)",
+            "more of the view than usual is not in the map (25 %)",
             "traffic baked into the map stands in view (45 %)",
         ],
         ["nothing in view"],
