@@ -235,8 +235,8 @@ class VirtualSettings(Settings):
     """How a vehicle sees with its sensor, and how it is started in the virtual drive."""
 
     range_max: Positive | None = None
-    """Usable range [m], no more than the sensor's; not given: the sensor's, as far as a model in use
-    was trained over it."""
+    """Usable range [m], no more than the sensor's; not given: the sensor's, as far as a model in
+    use was trained over it."""
     range_min: Annotated[float, Field(ge=0.0)] = 0.9
     """Surfels nearer than this are ignored: the vehicle itself is there [m]."""
     blind_rear_deg: Degrees = 0.0
