@@ -211,7 +211,7 @@ def test_a_traceback_only_with_debug(tmp_path: Path, capsys: Told) -> None:
     assert run([*arguments, "--debug"]) == 2
     debug = capsys.readouterr()
     assert plain.out == ""
-    assert plain.err.startswith(f"error: no tile store at {tmp_path}/none.zarr: ")
+    assert plain.err.startswith(f"error: {tmp_path}/none.zarr: no tile store")
     assert plain.err.count("\n") == 1
     assert "Traceback" not in plain.err
     assert "Traceback" in debug.err
@@ -361,7 +361,8 @@ SEEN = "a\\x1b]0;taken"
     [
         (["info", f"{EVIL}.pcd"], 0),
         (["info", f"{EVIL}.las"], 1),
-        (["info", f"{EVIL}.pcd", f"{EVIL}.pcd"], 2),
+        (["info", f"{EVIL}.pcd", f"{EVIL}.pcd"], 0),
+        (["template", f"{EVIL}.pcd"], 2),
         (["info", f"--{EVIL}"], 2),
         (["ingest", f"{EVIL}.pcd", f"{EVIL}.las", "--store", f"{EVIL}.zarr"], 1),
         (["status", f"{EVIL}.zarr", "--debug"], 2),

@@ -247,7 +247,7 @@ def test_a_job_says_what_it_could_not_measure(job: RunSettings, capsys: Told) ->
     assert record["drives"] == report["drives"]
     page = html.unescape((Path(job.out) / "report" / "index.html").read_text())
     assert GAP in page
-    assert "less than 50 % evaluated" in page.replace("\xa0", " ")
+    assert "less than 50 % measured" in page.replace("\xa0", " ")
     assert run(["run", config, "--workers", "1"]) == 0
     shown = capsys.readouterr()
     assert "keyframe_poses: measured 3 of 31 scans" in shown.out
