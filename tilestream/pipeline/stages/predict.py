@@ -27,7 +27,7 @@ MODEL_BYTES = 300_000_000
 
 @stage(
     "predict",
-    version=8,
+    version=9,
     memory=lambda counts: MODEL_BYTES + BYTES_PER_ROW * counts["places"],
     seconds=0.004,
     columns=(*PLACE_COLUMNS, *PREDICTION_COLUMNS, *COVARIANCE_COLUMNS),
