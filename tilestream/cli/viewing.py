@@ -11,8 +11,10 @@ from tilestream.apps.scene import MOST_POINTS, Scene, scene_of
 from tilestream.apps.view import require_display, show
 from tilestream.cli.printing import out, say_notes
 from tilestream.counts import count_of
+from tilestream.files import Files
 from tilestream.grid import TileKey
 from tilestream.pipeline.jobs.run_folder import map_of
+from tilestream.pipeline.jobs.run_state import record_of
 from tilestream.pipeline.jobs.sources import map_notes
 from tilestream.report.colours import FIXED
 from tilestream.report.formatting import CM_PER_M
@@ -34,6 +36,7 @@ def view(
 ) -> None:
     """Show a map in 3D, the route on it coloured by measured or estimated error."""
     key = None if tile is None else TileKey.parse(tile)
+    record_of(Files.at(place))  # a damaged one is refused whether a window opens or not
     require_display(screenshot)
     say_notes(map_notes(map_of(place)))
     scene = scene_of(place, tile=key, points=points)
