@@ -52,7 +52,6 @@ SMALLEST = (
 OF_A_FINISHED_RUN = (
     "covariance.py retrained",
     "covariance.py retrained --drives drive",
-    "drive_estimate.py drive",
     "experiment.py city",
     "filter.py city drive --train city --seeds 2 --train-seeds 1",
     "over_runs.py retrained --competitors physics",
