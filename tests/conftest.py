@@ -64,6 +64,7 @@ LONG = (
     "starts_of",
     "pairs",
     "degraded_drives",
+    "unfit",
     "export",
 )
 """Files of ten seconds and more, the longest first: what is begun last must be short, or one of
