@@ -21,12 +21,14 @@ from tilestream.errors import require_all_done
 from tilestream.factors.rows import in_route_order
 from tilestream.grid import MM_PER_M, whole_mm
 from tilestream.matcher import RegistrationSettings
+from tilestream.model.card import CHECKED
 from tilestream.model.file import load_model
 from tilestream.model.shipped import SHIPPED, file_of, is_shipped
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.jobs.along_routes import SENSOR_HEIGHT, samples_along
 from tilestream.pipeline.jobs.inventory import make_tables
+from tilestream.pipeline.jobs.run_worth import REAL
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.observe import Observing, observe
 from tilestream.records import Route, RouteZ
@@ -133,7 +135,7 @@ def worth_told() -> tuple[str, ...]:
     told += "they tell choices apart; how large the error is, is not checked here."
     if not is_shipped():
         return (told,)
-    real = load_model(file_of(SHIPPED)).card.get("checked", {}).get("real drives", {})
+    real = load_model(file_of(SHIPPED)).card.get(CHECKED, {}).get(REAL, {})
     if "spearman" not in real:
         return (told,)
     middle, low, high = real["spearman"]

@@ -234,10 +234,7 @@ def show_update(folder: Files, update: dict[str, Any]) -> None:
     say(update["told"])
     try:
         found = map_diff.diff(folder.address)
-    except (
-        UsageError,
-        StoreError,
-    ):  # nothing is kept of before, as of a report of an older version
+    except (UsageError, StoreError):  # of an older version: nothing is kept of before
         return
     worse, limit = distance(float(found.worse["length"].sum())), cm(found.limit, 0)
     why = f": `tilestream diff {folder.address}` says where and why" if len(found.worse) else ""

@@ -4,8 +4,9 @@ from collections.abc import Iterable
 
 import pandas as pd
 
-from tilestream.pipeline.engine.outputs import Parquet
+from tilestream.pipeline.engine.plan import paths_of
 from tilestream.pipeline.engine.stage import Task
+from tilestream.tables import read_tables
 
 NVTL = 2.3
 """Autoware takes a pose whose NVTL is below this as not converged (its ndt_scan_matcher)."""
@@ -39,12 +40,10 @@ def unfit(rows: pd.DataFrame) -> str:
 
 def labels_by_drive(labels: Iterable[Task]) -> dict[str, pd.DataFrame]:
     """The rows of label tasks that are done, by drive."""
-    tables: dict[str, list[pd.DataFrame]] = {}
-    for task in labels:
-        assert isinstance(task.writes, Parquet)
-        group = task.writes.path.rsplit("/", 2)[1]
-        tables.setdefault(group, []).append(task.writes.read().rows)
-    return {name: pd.concat(parts, ignore_index=True) for name, parts in tables.items()}
+    of_drive: dict[str, list[str]] = {}
+    for path in paths_of(labels):
+        of_drive.setdefault(path.rsplit("/", 2)[1], []).append(path)
+    return {name: read_tables(paths) for name, paths in of_drive.items()}
 
 
 def unfit_drives(labels: Iterable[Task]) -> dict[str, str]:
