@@ -736,14 +736,8 @@ def test_a_pipeline_that_ships_is_a_job(name: str) -> None:
     settings = read_settings(PIPELINES / f"{name}.yaml")
     assert settings.out
     assert settings.label.matcher == "autoware"
+    assert settings.model.use in (None, "shipped"), "a job that ships needs the output of no other"
     assert {p.stem for p in PIPELINES.glob("*.yaml")} == {"shinjuku", "drive", "city", "retrain"}
-
-
-def test_the_model_of_one_pipeline_fits_the_other() -> None:
-    """The drive is estimated by the forest of the simulation, which must have been made alike."""
-    made, used = (read_settings(PIPELINES / f"{name}.yaml") for name in ("shinjuku", "drive"))
-    assert used.model.use == f"{made.out}/model.skops"
-    assert making_of(used) == making_of(made)
 
 
 # --- Routes that were drawn
