@@ -109,6 +109,28 @@ def test_a_crs_that_cannot_be_read_or_is_unnamed_is_a_note(tmp_path: Path) -> No
     assert any("no CRS by a code" in note for note in found.notes)
 
 
+def test_a_unit_that_nothing_tells_is_said(tmp_path: Path) -> None:
+    path = tmp_path / "a.laz"
+    assumed = "names no unit of length: taken to be in metres"
+    for crs in (None, "EPSG:32654"):  # what we write is in metres
+        write_las(path, np.zeros((1, 3)), crs=crs)
+        assert open_source(path).info().notes == ()
+    header, record = record_of(3, "1.2")
+    laspy.LasData(header, record).write(path)
+    assert assumed in open_source(path).info().notes
+    # The keys of GeoTIFF may name a unit and no CRS.
+    header.add_crs(pyproj.CRS("EPSG:32654"))
+    laspy.LasData(header, record).write(path)
+    unknown = struct.pack("<4H", 3072, 0, 1, 32767)
+    without = path.read_bytes().replace(struct.pack("<4H", 3072, 0, 1, 32654), unknown)
+    unit = struct.pack("<2H", 1024, 0)
+    at = without.index(unit)  # the key of the kind of CRS makes room for that of the unit
+    for code, said in ((9001, False), (9002, False), (9999, True)):
+        key = struct.pack("<4H", 3076, 0, 1, code)
+        path.write_bytes(without[:at] + key + without[at + 8 :])
+        assert (assumed in open_source(path).info().notes) is said, code
+
+
 def laz_of_chunks(edges: list[int]) -> tuple[bytes, np.ndarray]:
     """A LAZ file whose chunks end where they are told to, as in COPC."""
     header, record = record_of(7, "1.4", edges[-1])

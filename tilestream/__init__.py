@@ -62,6 +62,7 @@ if TYPE_CHECKING:
     from tilestream.pipeline.jobs.run_settings import RunSettings
     from tilestream.pipeline.jobs.starts_of import starts_of
     from tilestream.pipeline.jobs.train_over import train_over
+    from tilestream.pipeline.jobs.unfit import unfit
     from tilestream.records import Cells, Column, LocalizationError, Registrations, Route
     from tilestream.registration import register
     from tilestream.sensor import HDL64, OS1_128, VLP16, Sensor
@@ -130,6 +131,7 @@ __all__ = [
     "status",
     "template",
     "train_over",
+    "unfit",
     "verify",
     "view",
     "warm",
@@ -166,6 +168,7 @@ _LATE = {
     "pipeline.jobs.run_settings": ("RunSettings",),
     "pipeline.jobs.starts_of": ("starts_of",),
     "pipeline.jobs.train_over": ("train_over",),
+    "pipeline.jobs.unfit": ("unfit",),
     "records": ("Cells", "Column", "LocalizationError", "Registrations", "Route"),
     "registration": ("register",),
     "sensor": ("HDL64", "OS1_128", "Sensor", "VLP16"),

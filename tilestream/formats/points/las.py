@@ -21,7 +21,7 @@ from tilestream.crs import Entered, parsed
 from tilestream.errors import CorruptSourceError, UsageError
 from tilestream.files import Files
 from tilestream.formats.base import Bounds, SourceInfo, corner_of
-from tilestream.formats.points.las_crs import crs_of
+from tilestream.formats.points.las_crs import OURS, crs_of
 from tilestream.formats.points.laz_rows import LazRows, chunks_of, laspy_errors
 from tilestream.formats.points.rows import (
     BinaryRows,
@@ -215,7 +215,7 @@ def write_las(path: str | os.PathLike[str], points: ArrayLike, *, crs: str | Non
     if not np.isfinite(table).all():
         raise UsageError(f"{os.fspath(path)}: LAS holds no NaN or infinite coordinates")
     header = laspy.LasHeader(version="1.4", point_format=6)
-    header.creation_date = NO_DAY
+    header.creation_date, header.generating_software = NO_DAY, OURS
     header.scales = np.full(3, _SCALE)
     header.offsets = (
         np.round((table.min(axis=0) + table.max(axis=0)) / 2) if len(table) else np.zeros(3)

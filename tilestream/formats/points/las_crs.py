@@ -21,10 +21,14 @@ _CODES = range(1024, 32767)
 """Those of EPSG."""
 _DOUBLES = 34736
 """Where the values of a key lie that are no whole numbers."""
+OURS = "tilestream"
+"""The program that wrote a file, where that is us: in metres."""
+_NO_UNIT = "names no unit of length: taken to be in metres"
 
 
 def crs_of(header: laspy.LasHeader, path: str) -> Entered:
-    """The CRS as it enters a map; a note where a file has records of one that cannot be read.
+    """The CRS as it enters a map; notes where a file has records of one that cannot be read, and
+    where nothing tells its unit.
 
     Raises:
         CrsError: a CRS that no map can have; see `crs.enter`.
@@ -42,6 +46,8 @@ def crs_of(header: laspy.LasHeader, path: str) -> Entered:
         return _of_keys(keys, path, notes)
     if not notes and any(record.user_id == "LASF_Projection" for record in records):
         notes = ("its projection records name no CRS by a code",)
+    if header.generating_software != OURS:
+        notes = (*notes, _NO_UNIT)
     return Entered(None, notes=notes)
 
 
@@ -60,6 +66,8 @@ def _of_keys(keys: dict[int, float], path: str, notes: tuple[str, ...]) -> Enter
     found = enter(plane, path, xy=xy, z=z)
     if plane is None and not notes:
         notes = ("its projection records name no CRS by a code",)
+    if plane is None and xy is None:
+        notes = (*notes, _NO_UNIT)
     return Entered(found.crs, found.xy, found.z, (*notes, *found.notes))
 
 

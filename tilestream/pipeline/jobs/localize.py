@@ -92,7 +92,7 @@ def localize(
 
     Returns:
         A row per sample point in the order of the drive; `status` and `reason` say where none
-        could be measured.
+        could be measured, `unfit` whether they tell anything of this map.
 
     Raises:
         UsageError: settings that cannot be, a spacing that is not positive, no scan selected, or

@@ -129,7 +129,7 @@ class DriveLog(_WholeFile):
 
 @stage(
     "survey",
-    version=2,
+    version=3,
     memory=lambda counts: SCENE_BYTES + counts["rays"] * BYTES_PER_RAY,
     seconds=0.07,
 )
