@@ -10,7 +10,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tilestream.pipeline.jobs.run_worth import FEW_PLACES, worth_of
-from tilestream.report.formatting import cm_about, cm_span
+from tilestream.report.formatting import cm_about, cm_limit, cm_span
 from tilestream.report.worth import BLOCKS, ELSEWHERE, HERE, NOWHERE, OWN, SIMULATION
 
 NO_LABELS = pd.DataFrame()
@@ -162,3 +162,8 @@ def test_elsewhere_estimates_are_off_in_proportion(entry: str) -> None:
     assert found.share == pytest.approx(0.5)
     here = worth(labels([0.04, 0.05], [0.05, 0.06]), card=card, shipped=True)
     assert here.mae == pytest.approx(0.01)  # what was measured here counts as it is
+
+
+def test_a_limit_keeps_all_digits_that_were_given() -> None:
+    told = [cm_limit(x).replace("\u00a0", " ") for x in (0.001, 0.07, 0.125, 0.3, 1.1)]
+    assert told == ["0.1 cm", "7 cm", "12.5 cm", "30 cm", "110 cm"]

@@ -13,7 +13,7 @@ from tilestream.cli.fields import fields, with_settings
 from tilestream.cli.options import AsJson, or_elsewhere
 from tilestream.cli.printing import out, print_json, say, show_worth
 from tilestream.cli.progress import progress
-from tilestream.report.formatting import cm, cm_about, distance
+from tilestream.report.formatting import cm_about, cm_limit, distance
 from tilestream.report.summary import plain
 from tilestream.settings import DEFAULT_MEMORY, ReportSettings
 
@@ -50,7 +50,7 @@ def advise(
         print_json(content_of(found))
         return
     if found.stretches.empty:
-        say(f"No estimate is above {cm(found.threshold, 0)}: there is nothing to mend")
+        say(f"No estimate is above {cm_limit(found.threshold)}: there is nothing to mend")
         return
     show_worth({"told": found.worth})
     out.print(advice_table(found))
@@ -84,7 +84,7 @@ def verdict(found: advising.Advice, row: Any) -> str:
             "have to"
         )
     change = f"{row['best']}: {cm_about(row['now_m'], DIGITS)} to {cm_about(row['best_m'], DIGITS)}"
-    limit = cm(found.threshold, 0)
+    limit = cm_limit(found.threshold)
     told = f"{change}, {'within' if row['mends'] else 'still over'} {limit}"
     return " ".join(told.split())  # plain spaces
 

@@ -33,7 +33,7 @@ from tilestream.records import District
 from tilestream.report import cards, gate
 from tilestream.report.data import interpolated
 from tilestream.report.drives import EVALUATED, DriveMeasured
-from tilestream.report.formatting import cm, distance
+from tilestream.report.formatting import cm_limit, distance
 from tilestream.report.gate import GateSettings, Over
 from tilestream.report.measured import Measured
 from tilestream.report.summary import reasons_told
@@ -236,7 +236,7 @@ def show_update(folder: Files, update: dict[str, Any]) -> None:
         found = map_diff.diff(folder.address)
     except (UsageError, StoreError):  # of an older version: nothing is kept of before
         return
-    worse, limit = distance(float(found.worse["length"].sum())), cm(found.limit, 0)
+    worse, limit = distance(float(found.worse["length"].sum())), cm_limit(found.limit)
     why = f": `tilestream diff {folder.address}` says where and why" if len(found.worse) else ""
     say(f"{worse} of road got worse by more than {limit}{why}")
 

@@ -13,7 +13,7 @@ from tilestream.factors.catalogue import COLUMNS
 from tilestream.factors.stations import INTERPOLATED
 from tilestream.report.diff.data import TILES, MapDiff
 from tilestream.report.drives import DriveMeasured
-from tilestream.report.formatting import cm, cm_about, distance
+from tilestream.report.formatting import cm, cm_about, cm_limit, distance
 from tilestream.report.paper_tables import LIMITS
 from tilestream.report.summary import digits_of
 
@@ -126,7 +126,7 @@ def diff_table(found: MapDiff) -> Table:
     if places.compared_interpolated:
         between = f"{places.compared_interpolated:,} of these, before or after"
         table.add_row("interpolated, not evaluated", "", between)
-    by = f"by more than {cm(found.limit, 0)}"
+    by = f"by more than {cm_limit(found.limit)}"
     for what, rows in (("worse", places.worse), ("better", places.better)):
         length = distance(float(rows["length"].sum()))
         table.add_row(f"got {what} {by}", length, count_of(len(rows), "sample point"))

@@ -26,6 +26,11 @@ def cm(metres: Any, digits: int = 1) -> str:
     return f"{metres * CM_PER_M:.{digits}f}{_GLUE}cm" if known(metres) else NONE
 
 
+def cm_limit(metres: float) -> str:
+    """A limit in centimetres, with all digits that were given."""
+    return f"{metres * CM_PER_M:.10g}{_GLUE}cm"
+
+
 def cm_about(metres: Any, digits: int | None) -> str:
     """An estimate in centimetres, with as many significant digits as it deserves; None: with a
     digit behind the point.

@@ -18,7 +18,7 @@ from tilestream.report.data import (
     interpolated,
     like_training,
 )
-from tilestream.report.formatting import cm, cm_about, distance, known, percent, thousands
+from tilestream.report.formatting import cm, cm_about, cm_limit, distance, known, percent, thousands
 from tilestream.report.measured import measure_of
 from tilestream.report.paper_tables import paper_table_i, paper_table_iii, table_i, table_iii
 from tilestream.report.segments import reaches, segments, worst_measured, worst_places
@@ -141,7 +141,7 @@ def cards(content: Mapping[str, Any]) -> list[tuple[str, str]]:
     Args:
         content: `summary`, or what `report.json` has of it.
     """
-    head, limit = content["headline"], cm(content["threshold"], 0)
+    head, limit = content["headline"], cm_limit(content["threshold"])
     digits = digits_of(content)
     unlike = (percent(head["outside_share"]), "of the places unlike the training places")
     over = f"of the places over {limit}: {distance(head['over_length'])} of road"

@@ -13,7 +13,7 @@ from tilestream.report.diff.map import (
 )
 from tilestream.report.diff.profile import diff_profile
 from tilestream.report.diff.summary import diff_cards
-from tilestream.report.formatting import cm
+from tilestream.report.formatting import cm_limit
 from tilestream.report.page import MOST_PROFILES, MOST_ROUTES, MOST_SEGMENTS, render_page, template
 from tilestream.report.segments import BRIDGE
 
@@ -59,7 +59,7 @@ def diff_page(found: MapDiff, content: Mapping[str, Any]) -> str:
         absent=absent,
         cards=diff_cards(content),
         digits=content["digits"],
-        limit=cm(content["limit"], 0),
+        limit=cm_limit(content["limit"]),
         bridge=BRIDGE,
         profiles=profiles,
         changed=changed,
@@ -77,7 +77,7 @@ def _absent(content: Mapping[str, Any]) -> dict[str, str]:
     """Why sections have nothing to say, by section: they are left out."""
     places = content["compared"] or content["lost"] or content["appeared"] or content["left"]
     tiles = any(content[kind] for kind in ("added", "removed", "changed"))
-    limit = cm(content["limit"], 0)
+    limit = cm_limit(content["limit"])
     none = "no place has an estimate in both"
     if content["without_estimates"]:
         none = f"there are no estimates in {' and '.join(content['without_estimates'])}"

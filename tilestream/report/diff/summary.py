@@ -7,7 +7,7 @@ import numpy as np
 
 from tilestream.report.diff.data import TILES, Changes, MapDiff
 from tilestream.report.diff.gate import Verdict
-from tilestream.report.formatting import cm, cm_about, distance, thousands
+from tilestream.report.formatting import cm_about, cm_limit, distance, thousands
 from tilestream.report.summary import plain
 from tilestream.version import VERSION
 
@@ -132,7 +132,7 @@ def diff_cards(content: Mapping[str, Any]) -> list[tuple[str, str]]:
         ]
     if content["compared"]:
         between = content["compared_interpolated"]
-        by, digits = f"by more than {cm(content['limit'], 0)}", content["digits"]
+        by, digits = f"by more than {cm_limit(content['limit'])}", content["digits"]
         growth = content["worst_growth"]
         cards += [
             (distance(content["compared_m"]), f"of road compared, {_points(content['compared'])}"),
