@@ -155,3 +155,12 @@ def test_feet_that_only_the_user_names_are_refused(tmp_path: Path) -> None:
     assert same(str(store.settings.crs), "EPSG:32118")
     again = ts.ingest(tmp_path / "a.las", tmp_path / "map.zarr", crs="EPSG:32118")
     assert again.settings.crs == store.settings.crs
+
+
+@pytest.mark.parametrize("crs", ["EPSG:3857", "ESRI:102100"])
+def test_a_map_in_the_crs_of_web_maps_is_refused(crs: str, tmp_path: Path) -> None:
+    write_las(tmp_path / "a.laz", np.zeros((1, 3)), crs=crs)
+    with pytest.raises(CrsError, match=r"a\.laz.*1 / cos"):
+        ts.ingest([tmp_path / "a.laz"], tmp_path / "map.zarr")
+    with pytest.raises(CrsError, match="asked for"):
+        one_crs(crs, [("a", None)])

@@ -43,7 +43,7 @@ from tilestream.pipeline.engine.dashboard.words import (
     stages_html,
     workers_html,
 )
-from tilestream.pipeline.engine.events import page_url
+from tilestream.pipeline.engine.events import serve_page
 from tilestream.pipeline.engine.executor import Ahead, execute
 from tilestream.pipeline.engine.plan import Plan
 from tilestream.pipeline.engine.progress import (
@@ -246,7 +246,7 @@ WORDS = """[...document.querySelectorAll('*')].filter(e => e.shadowRoot).map(fun
 
 
 def test_a_browser_sees_tiles_change(new_workers: distributed.Client, tmp_path: Path) -> None:
-    url = page_url(new_workers)
+    url = serve_page(new_workers)
     assert url is not None
     n = 6
     gate = tmp_path / "gate"
@@ -285,7 +285,7 @@ def test_a_browser_sees_the_map_and_the_estimates_come(
     new_workers: distributed.Client, tmp_path: Path
 ) -> None:
     """Also who comes late; all of it on one screen, and the same as JSON."""
-    url, store = page_url(new_workers), small_map(tmp_path)
+    url, store = serve_page(new_workers), small_map(tmp_path)
     assert url is not None
     estimates = [0.02, 0.07, 0.12, 0.17, 0.22, 0.3, 0.8, float("nan")]
     plan = drawn_plan(store, tmp_path, estimates, "no space left")
@@ -417,7 +417,7 @@ def test_the_page_is_there_when_its_address_is_printed(elsewhere: bool, tmp_path
 def test_machines_get_the_same_from_a_scheduler_in_another_process(tmp_path: Path) -> None:
     with scheduler_elsewhere(1) as (address, _):
         with dask_client(address, None, 1) as client:
-            url = page_url(client)
+            url = serve_page(client)
             assert url is not None
             plan = city(3, tmp_path)
             execute(plan, client, None)
@@ -448,7 +448,7 @@ def test_machines_get_the_same_from_a_scheduler_in_another_process(tmp_path: Pat
 def test_what_will_follow_counts_for_the_time_left(
     new_workers: distributed.Client, tmp_path: Path
 ) -> None:
-    gate, url = tmp_path / "gate", page_url(new_workers)
+    gate, url = tmp_path / "gate", serve_page(new_workers)
     first = Nap(TileKey(0, 0), gate=str(gate))
     later = [Nap(TileKey(i, 0), "report") for i in range(3)]
     given: list[Task] = []
@@ -486,11 +486,13 @@ def test_what_will_follow_counts_for_the_time_left(
 
 
 def test_no_dashboard_no_page_and_no_harm() -> None:
-    assert page_url(None) is None
     with (
         distributed.LocalCluster(
             n_workers=1, processes=False, protocol="tcp", dashboard_address=None
         ) as cluster,
         distributed.Client(cluster) as client,
     ):
+        url = serve_page(client)  # for machines it is there
+        assert url is not None
         assert execute(Plan((Nap(TileKey(0, 0)),), MEMORY), client, None)[0].ok
+        assert get_json(url)["state"] == "ended"

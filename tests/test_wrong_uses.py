@@ -125,6 +125,7 @@ USES: list[tuple[str, int, str]] = [
     (f"{ESTIMATE} --sensor sensor.yaml", 2, "--sensor sensor.yaml, range_mx, mean range_max"),
     (f"{ESTIMATE} --sensor-height tall", 2, "--sensor-height, a valid"),
     (f"{ESTIMATE} --spacing 0", 2, "--spacing, 0.0"),
+    (f"{ESTIMATE} --spacing 1e-9", 2, "--spacing, 1e-09"),
     (f"{ESTIMATE} --range-max 7500", 2, "--range-max, 7500, 100 m"),
     (f"{ESTIMATE} --route-z sky", 2, "--route-z, sky, ground"),
     (f"{ESTIMATE} --fail-over nan", 2, "--fail-over, nan, above 0"),

@@ -122,13 +122,14 @@ def one_crs(asked: str | None, sources: Iterable[tuple[str, str | None]]) -> str
         sources: path and CRS of each source; None: its file names none.
 
     Raises:
-        CrsError: there are two, named with their sources; or one was asked for that is not in
-            metres, as which the points of a source that names none would be read.
+        CrsError: there are two, named with their sources; one was asked for that is not in metres,
+            as which the points of a source that names none would be read; or the one is that of web
+            maps, whose metres are none on the ground.
     """
-    named = [(path, crs) for path, crs in sources]
+    every = [(path, crs) for path, crs in sources]
     if asked is not None:
         entered = enter(asked, ASKED)
-        bare = [path for path, crs in named if crs is None]
+        bare = [path for path, crs in every if crs is None]
         if not entered.metric and bare:
             raise CrsError(
                 f"{ASKED}, {_short(asked)}, is in {entered.xy.name} and {bare[0]} names none, so "
@@ -136,13 +137,28 @@ def one_crs(asked: str | None, sources: Iterable[tuple[str, str | None]]) -> str
                 f"`pdal translate IN OUT --writers.las.a_srs={_short(asked)}`), or multiply its "
                 f"coordinates by {entered.xy.metres:.12g}"
             )
-        named.insert(0, (ASKED, entered.crs))
-    known = [(who, crs) for who, crs in named if crs is not None]
+        every.insert(0, (ASKED, entered.crs))
+    known = [(who, crs) for who, crs in every if crs is not None]
     for who, crs in known[1:]:
         require_same(*known[0], who, crs)
+    for who, crs in known[:1]:
+        if _method(parsed(crs, who)) == WEB_MERCATOR:
+            raise CrsError(
+                f"{who}: its CRS {named(crs)} is that of web maps, where a metre on the ground is "
+                "1 / cos(latitude) m, so no length would be right: project it to one that keeps "
+                "lengths first, e.g. UTM (for example with PDAL's filters.reprojection)"
+            )
     return known[0][1] if known else None
 
 
+def _method(crs: CRS) -> str:
+    """How a CRS projects; empty: it does not."""
+    how = _parts(crs)[0].coordinate_operation
+    return how.method_name if how else ""
+
+
+WEB_MERCATOR = "Popular Visualisation Pseudo Mercator"
+"""The name of its method."""
 ASKED = "the crs that was asked for"
 
 

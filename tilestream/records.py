@@ -15,6 +15,8 @@ from tilestream.notebook import draw_cells, draw_line, html_of
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
+LEAST_SPACING = 0.01
+"""Sample points lie at least so far apart along a route or drive [m]: a map is not known better."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from tilestream.config import Settings
 from tilestream.errors import UsageError
 from tilestream.files import local_path, place_of
 from tilestream.matcher import MATCHERS, Positive, RegistrationSettings, matcher_named
-from tilestream.records import District, RouteZ, TruePose
+from tilestream.records import LEAST_SPACING, District, RouteZ, TruePose
 from tilestream.sensor import SENSORS, Carrier, Mount, Sensor, Vehicle, named
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -352,7 +352,7 @@ class PlaceSettings(Settings):
 
     project_to: str | None = None
     """CRS to project routes to that are in degrees or in another one; not given: the map's."""
-    spacing: Positive = 1.0
+    spacing: Annotated[float, Field(ge=LEAST_SPACING)] = 1.0
     """Distance between sample points [m]."""
     sensor: Annotated[str | Sensor | Vehicle, BeforeValidator(named)] = "VLP16"
     """The vehicle's lidar: a name that ships, a YAML file, its fields, or a list of these, each

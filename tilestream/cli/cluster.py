@@ -14,7 +14,7 @@ from tilestream.cli.fields import TASKS
 from tilestream.cli.printing import err, say
 from tilestream.errors import UsageError
 from tilestream.pipeline.engine.cluster import LOOPBACK, TlsFiles, late_client
-from tilestream.pipeline.engine.events import page_url, serve_page
+from tilestream.pipeline.engine.events import serve_page
 from tilestream.pipeline.engine.late_client import around
 
 WORKERS = "Worker processes on this machine; 1: this process does all."
@@ -52,8 +52,8 @@ class Cluster:
 @contextmanager
 def _watched(client: Any) -> Iterator[None]:
     """Print where to watch what a client does, once the page is there."""
-    page = page_url(client)
-    if page is not None and serve_page(client):
+    page = serve_page(client)
+    if page is not None:
         say(f"Watch it at {page}", to=err)
     yield
 

@@ -40,7 +40,7 @@ def sample_points(
         The sample points as a route; z is NaN where there is no height, see `raised`.
 
     Raises:
-        UsageError: `spacing` is not positive or longer than the route, a height that is not finite.
+        UsageError: `spacing` is below 1 cm or longer than the route, a height that is not finite.
         TileNotReadyError: a tile under the route failed or was skipped.
     """
     points = resample(route, spacing)

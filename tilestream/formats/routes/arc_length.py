@@ -8,7 +8,7 @@ import numpy as np
 from tilestream.errors import CorruptSourceError, PoseError, UsageError
 from tilestream.formats.motion import vertices
 from tilestream.kernels.fixed_order import norms
-from tilestream.records import Float64, Route
+from tilestream.records import LEAST_SPACING, Float64, Route
 
 TANGENT_M = 0.5
 """The heading at a point is the direction of the chord from this far before to this far after."""
@@ -58,7 +58,7 @@ def route_of(
         i = int(np.argmax(steps > max_jump))
         raise PoseError(
             f"{where}: jumps {steps[i]:.1f} m from point {kept[i]} to point {kept[i + 1]}, more "
-            f"than max_jump = {max_jump:g} m; split the route there or raise max_jump"
+            f"than {max_jump:g} m: split the route there (ts.read_routes takes another max_jump)"
         )
     arc_length: Float64 = np.concatenate([[0.0], np.cumsum(steps)])
     route = positions[kept]
@@ -79,7 +79,7 @@ def resample(route: Route, spacing: float = 1.0) -> Route:
         A route whose `arc_length` and heading are those of the given one at its points.
 
     Raises:
-        UsageError: `spacing` is not positive, or longer than the route.
+        UsageError: `spacing` is below 1 cm, or longer than the route.
     """
     require_length(route, spacing)
     length = route.arc_length[-1]
@@ -95,13 +95,13 @@ def require_length(route: Route, spacing: float) -> None:
     """Refuse a route that is shorter than the distance between its points is to be [m].
 
     Raises:
-        UsageError: `spacing` is not positive, or longer than the route.
+        UsageError: `spacing` is below 1 cm, or longer than the route.
     """
     length = route.arc_length[-1]
-    if not 0 < spacing <= length:
+    if not LEAST_SPACING <= spacing <= length:
         raise UsageError(
-            f"spacing = {spacing}: must be above 0 and at most the length of route "
-            f"{route.route_id}, {length:.2f} m"
+            f"spacing = {spacing}: must be at least {LEAST_SPACING} m and at most the length of "
+            f"route {route.route_id}, {length:.2f} m"
         )
 
 

@@ -189,6 +189,7 @@ class _Workers:
         self._threads = 0
         self._asked = -LOOK_EVERY
         self._seen = time.monotonic()
+        self._told = False
 
     def threads(self) -> int:
         """Threads of all workers, at most a few seconds old.
@@ -211,7 +212,14 @@ class _Workers:
             self._meet(new)
         self._asked, self._threads = now, sum(found.values())
         if self._threads:
-            self._seen = now
+            self._seen, self._told = now, False
+        elif not self._told:
+            self._told = True
+            logger.info(
+                "the scheduler at %s has no worker: waiting %.0f s for one",
+                self._address,
+                self._patience,
+            )
         elif now - self._seen > self._patience:
             raise TaskError(
                 f"the scheduler at {self._address} has had no worker for {self._patience:.0f} s: "

@@ -23,26 +23,31 @@ SEND_EVERY = 0.5
 """How often outcomes are sent [s]."""
 
 
-def page_url(client: Any | None) -> str | None:
-    """Address of the page for people; None where there is no dashboard."""
-    link = "" if client is None else client.dashboard_link
-    return f"{link.removesuffix('status')}{NAME}" if link else None
-
-
-def serve_page(client: Any) -> bool:
-    """Have the scheduler serve the page, as it does from now on; whether it can.
+def serve_page(client: Any) -> str | None:
+    """Have the scheduler serve the page, as it does from now on.
 
     One that serves it already goes on.
+
+    Returns:
+        Its address; of a scheduler without a dashboard that of `tilestream.json`, for machines;
+        None: it can serve nothing.
     """
+    link = client.dashboard_link.removesuffix("status")
+    if not link:
+        return None
     try:
         # Bokeh is heavy, and most processes that import this one have no scheduler.
-        from tilestream.pipeline.engine.dashboard.plugin import ProgressPlugin  # noqa: PLC0415
+        from tilestream.pipeline.engine.dashboard.plugin import (  # noqa: PLC0415
+            ProgressPlugin,
+            has_pages,
+        )
 
         client.register_plugin(ProgressPlugin())
+        name = NAME if client.run_on_scheduler(has_pages) else f"{NAME}.json"
     except Exception as error:  # noqa: BLE001 - whatever the scheduler lacks
         logger.warning("no Tilestream page on the dashboard: %s", error or repr(error))
-        return False
-    return True
+        return None
+    return f"{link}{name}"
 
 
 @contextmanager

@@ -95,7 +95,7 @@ def localize(
         could be measured, `unfit` whether they tell anything of this map.
 
     Raises:
-        UsageError: settings that cannot be, a spacing that is not positive, no scan selected, or
+        UsageError: settings that cannot be, a spacing below 1 cm, no scan selected, or
             one that the map was made of (`allow_overlap`).
         SourceNotFoundError: there is no such log.
         SourceError: the log cannot be read, has no clouds or no poses.

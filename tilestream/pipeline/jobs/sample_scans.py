@@ -9,7 +9,7 @@ from tilestream.errors import UsageError
 from tilestream.formats.logs import ScanLog, ScanSelection
 from tilestream.formats.motion import along
 from tilestream.pipeline.stages.drive_scans import Sample
-from tilestream.records import Float64, Int64
+from tilestream.records import LEAST_SPACING, Float64, Int64
 
 BESIDE = 0.5
 """How far along the drive other scans of a sample point may be from it [m]."""
@@ -25,13 +25,13 @@ def choose_samples(
     drive within `BESIDE`, no scan at two sample points; the first is the sample point's own.
 
     Raises:
-        UsageError: `spacing` is not positive, `per_point` not 1 or more, or no scan with a pose is
+        UsageError: `spacing` is below 1 cm, `per_point` not 1 or more, or no scan with a pose is
             selected.
     """
     if per_point < 1:
         raise UsageError(f"scans_per_point is {per_point}: give at least 1")
-    if not 0.0 < spacing < np.inf:
-        raise UsageError(f"spacing is {spacing!r}: give a positive length in metres")
+    if not LEAST_SPACING <= spacing < np.inf:
+        raise UsageError(f"spacing is {spacing!r}: give a length of {LEAST_SPACING} m or more")
     chosen = scans.indices(log.stamps_ns)
     chosen = chosen[log.posed[chosen]]
     if not len(chosen):

@@ -112,11 +112,21 @@ def _planned(key: Any) -> str:
     return str(key).partition("#")[0]
 
 
+def has_pages(dask_scheduler: Any) -> bool:
+    """Whether the scheduler, in whose process this runs, has a dashboard."""
+    return bool(_pages(dask_scheduler))
+
+
+def _pages(scheduler: Any) -> list[BokehTornado]:
+    applications = scheduler.http_application.applications
+    return [app for app in applications if isinstance(app, BokehTornado)]
+
+
 def _serve(plugin: ProgressPlugin) -> None:
     """Add the page and the route to the server that runs; without a dashboard, the route alone."""
     scheduler = plugin.scheduler
     server = scheduler.http_application
-    pages = [app for app in server.applications if isinstance(app, BokehTornado)]
+    pages = _pages(scheduler)
     prefix = pages[0].prefix if pages else ""
     server.add_handlers(".*$", [(rf"{prefix}/{NAME}\.json", JsonHandler, {"plugin": plugin})])
     if pages:
