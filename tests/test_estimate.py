@@ -24,6 +24,7 @@ from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.jobs.estimate import estimate_settings
 from tilestream.pipeline.jobs.forecast import forecast
 from tilestream.pipeline.jobs.inventory import tables_in
+from tilestream.pipeline.jobs.run_before import say_other_map
 from tilestream.pipeline.jobs.run_inputs import inputs_of
 from tilestream.pipeline.jobs.run_making import as_far_as_known
 from tilestream.pipeline.jobs.run_settings import ModelSettings, RunSettings
@@ -387,3 +388,20 @@ def test_virtual_scans_reach_as_far_as_the_model_knows_unless_told(
     assert as_far_as_known(settings) == settings
     assert settings.observe is not None
     assert settings.observe.range_max == seen
+
+
+def test_a_run_of_another_map_is_told_of_before_it_is_replaced(
+    inputs: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    one, other = sorted(inputs.glob("map_*.pcd"))[:2]
+    for sources, told in (([one], False), ([one, other], False), ([other], False), ([one], True)):
+        settings = asked(sources, [inputs / "canyon.mcap"], tmp_path / "run")
+        caplog.clear()
+        say_other_map(settings)
+        assert ("of another map" in caplog.text) is told
+        text = yaml.safe_dump(settings.model_dump(mode="json"))
+        settings.folder.under("config.yaml").write(text.encode())
+    settings.folder.under("config.yaml").write(b"map: [1")
+    caplog.clear()
+    say_other_map(settings)
+    assert caplog.text == ""

@@ -193,6 +193,18 @@ def the_job_is_there(settings: RunSettings, capsys: pytest.CaptureFixture[str]) 
     assert "7" in capsys.readouterr().out
 
 
+def test_a_bucket_that_is_misspelt_is_not_made(here: Path, s3_bucket: str) -> None:
+    other = f"{s3_bucket}-misspelt"
+    settings = a_job_on(f"{other}/run", here)
+    with pytest.raises(UsageError, match="create it first"):
+        ts.run(settings)
+    with pytest.raises(UsageError, match="create it first"):
+        ts.ingest(settings.map.sources, f"{other}/map.zarr")
+    assert not Files.at(other).there()
+    with pytest.raises(UsageError, match="nothing is there"):
+        ts.info(f"{s3_bucket}/nosuch.zarr")
+
+
 def test_a_run_directory_in_an_object_store(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     settings = a_job_on(f"memory://{uuid.uuid4().hex}/run", here)
     before = names_in(here)

@@ -386,6 +386,16 @@ def test_verify_reads_the_tables_of_a_folder(store: ts.TileStore, tmp_path: Path
     assert verify(tmp_path / "out")[1] == []
 
 
+@pytest.mark.parametrize(("state", "whole"), [("done", True), ("failed", True), ("stopped", False)])
+def test_a_run_that_did_not_end_is_not_whole(state: str, whole: bool, tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text(json.dumps(sealed({"state": state, "files": {}})))
+    read, damages = verify(tmp_path)
+    assert read == 1
+    assert (damages == []) is whole
+    assert run(["verify", str(tmp_path), "--repair"]) == (0 if whole else 1)
+    assert (tmp_path / "run.json").exists()
+
+
 # --- Absent is not unreadable
 
 

@@ -239,9 +239,16 @@ class Files:
 
         Raises:
             FileExistsError, NotADirectoryError: a file is in the way.
+            UsageError: there is no such bucket: a typing error must not make one.
         """
         if not self.local:
             with self._reached():
+                bucket = self.root.split("/")[0]  # empty where there are none
+                if bucket and not self.fs.exists(bucket):
+                    raise UsageError(
+                        f"{self.address}: there is no {bucket}: create it first, or mend the "
+                        "address"
+                    )
                 self.fs.makedirs(self.root, exist_ok=True)
             return
         folder = Path(self.root)

@@ -13,8 +13,9 @@ from tilestream.files import Files, place_of
 from tilestream.lock import only_writer
 from tilestream.marks import unsealed
 from tilestream.pipeline.jobs.inventory import Entry, inventory_of
-from tilestream.pipeline.jobs.run_book import checksum_of
+from tilestream.pipeline.jobs.run_book import ENDED, checksum_of
 from tilestream.pipeline.jobs.run_names import INVENTORY, RECORD
+from tilestream.pipeline.jobs.run_state import state_told
 from tilestream.pipeline.stages.label import label
 from tilestream.store import NODE, POINTS, Tile, open_store
 from tilestream.tables import read_mark, read_tables
@@ -183,14 +184,17 @@ def _read(path: str, entry: Entry) -> None:
 
 
 def _record(folder: str) -> Findings:
-    """The record of a run, and the files whose checksums it keeps."""
-    record = Files.at(folder).under(RECORD)
+    """The record of a run, whether the run has ended, and the files whose checksums it keeps."""
+    run_dir = Files.at(folder)
+    record = run_dir.under(RECORD)
     try:
-        files: dict[str, str] = unsealed(json.loads(record.read())).get("files", {})
+        found = unsealed(json.loads(record.read()))
+        files: dict[str, str] = found.get("files", {})
     except (ValueError, AttributeError, OSError) as error:
         yield Damage(record.root, f"the record of the run is damaged ({error})", (), record.remove)
         return
-    yield None
+    ended = found.get("state") in ENDED
+    yield None if ended else Damage(folder, f"the run is {state_told(run_dir, found)}")
     for name, checksum in files.items():
         file = Files.at(folder).under(name)
         yield _wrong(file.root, partial(_compare, file, checksum), (), file.remove)

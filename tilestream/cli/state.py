@@ -35,7 +35,8 @@ def status(
         out.print(tile_table(opened))
         if run:
             say(f"The run is {state}")
-        say(f"The map is {condition}")
+        more = ", by its marks: `tilestream verify` reads all of it" if condition.whole else ""
+        say(f"The map is {condition}{more}")
         say_notes(map_notes(opened))
     if failures:
         raise PartialError(f"{store} is not whole, or parts of it failed:", failures)

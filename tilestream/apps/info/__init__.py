@@ -7,7 +7,7 @@ import os
 
 from tilestream.apps.info.kinds import KINDS
 from tilestream.apps.info.record import Info
-from tilestream.errors import UnknownFormatError
+from tilestream.errors import UnknownFormatError, UsageError
 from tilestream.files import Files
 from tilestream.formats import describe
 from tilestream.settings import LogOptions
@@ -24,6 +24,7 @@ def info(path: str | os.PathLike[str], log_options: LogOptions | None = None) ->
 
     Raises:
         SourceNotFoundError: nothing there.
+        UsageError: nothing there, at a URL; or a file of others, which is read from a disk.
         UnknownFormatError: nothing that tilestream reads.
         TilestreamError: it is damaged, or cannot be read; as its own reader says.
 
@@ -32,7 +33,12 @@ def info(path: str | os.PathLike[str], log_options: LogOptions | None = None) ->
         'routes'
     """
     name = os.fspath(path)
-    names = frozenset(Files.at(name).names())
+    place = Files.at(name)
+    names = frozenset(place.names())
+    if not (place.local or names or place.there()):
+        raise UsageError(
+            f"{name}: nothing is there; what others made is read from a disk: copy it here"
+        )
     for kind in KINDS:
         if kind.fits(name, names):
             return kind.describe(name, log_options or LogOptions())

@@ -32,7 +32,7 @@ from tilestream.pipeline.engine.costs import learn
 from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.jobs.estimator import Estimator
 from tilestream.pipeline.jobs.inventory import settle
-from tilestream.pipeline.jobs.run_before import tell
+from tilestream.pipeline.jobs.run_before import say_other_map, tell
 from tilestream.pipeline.jobs.run_book import (
     Book,
     checksums,
@@ -185,6 +185,7 @@ def dataset_of(run_dir: str | os.PathLike[str]) -> Dataset:
 
 def _begin(settings: RunSettings) -> Book:
     """The run directory with the effective settings."""
+    say_other_map(settings)
     text = yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
     settings.folder.under(CONFIG).write(text.encode())
     return Book(settings.folder, told_before(settings.folder.under(RECORD)))

@@ -8,22 +8,29 @@ before/places.parquet, before/tiles.json   the same, of before the last update o
 
 import io
 import json
+import logging
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import pandas as pd
+from yaml import YAMLError
 
+from tilestream.bounded_yaml import parse_yaml
 from tilestream.errors import DamagedError, SourceNotFoundError, UsageError
 from tilestream.files import Files
 from tilestream.grid import TileKey
 from tilestream.marks import AGAIN, hash_of, sealed, unsealed
+from tilestream.notes import some_of
 from tilestream.pipeline.jobs.map_update import Update
 from tilestream.pipeline.jobs.run_book import checksum_of
 from tilestream.pipeline.jobs.run_making import making_of
+from tilestream.pipeline.jobs.run_names import CONFIG
 from tilestream.pipeline.jobs.run_settings import RunSettings
 from tilestream.pipeline.jobs.run_state import record_of
 from tilestream.pipeline.stages.map_plan import MapPlan
+
+logger = logging.getLogger(__name__)
 
 REPORT, BEFORE = "report", "before"
 """The folders of what is, and of what was."""
@@ -63,6 +70,27 @@ def tell(settings: RunSettings, map_plan: MapPlan) -> None:
     )
     text = json.dumps(sealed(asdict(told)), indent=0) + "\n"
     report.under(TILES).write(text.encode())
+
+
+def say_other_map(settings: RunSettings) -> None:
+    """Say so where the run directory holds a run of a map that shares no file with this one's."""
+    try:
+        text = settings.folder.under(CONFIG).read().decode()
+        before, now = _named(parse_yaml(text)["map"]), _named(settings.map.model_dump(mode="json"))
+    except (OSError, ValueError, YAMLError, TypeError, KeyError, AttributeError):
+        return  # there is none, or it is no one's
+    if before and now and not before & now:
+        logger.warning(
+            "%s holds a run of another map, %s: its report is replaced, its places are kept for "
+            "`tilestream diff`",
+            settings.out,
+            some_of(sorted(before), 1),
+        )
+
+
+def _named(of_map: Mapping[str, Any]) -> set[str]:
+    """The files, or the store, that a map is named by."""
+    return {*of_map["sources"], *filter(None, [of_map["store"]])}
 
 
 def update_of(settings: RunSettings, map_plan: MapPlan) -> Update | None:
