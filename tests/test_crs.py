@@ -10,7 +10,7 @@ import pytest
 
 import tilestream as ts
 from tilestream.crs import enter, one_crs, same
-from tilestream.errors import CrsError
+from tilestream.errors import CrsError, PartialError
 from tilestream.formats import open_source
 from tilestream.formats.base import PointSource
 from tilestream.formats.points.las import write_las
@@ -164,3 +164,10 @@ def test_a_map_in_the_crs_of_web_maps_is_refused(crs: str, tmp_path: Path) -> No
         ts.ingest([tmp_path / "a.laz"], tmp_path / "map.zarr")
     with pytest.raises(CrsError, match="asked for"):
         one_crs(crs, [("a", None)])
+
+
+def test_a_map_in_degrees_is_named_not_the_route_on_it(tmp_path: Path) -> None:
+    write_las(tmp_path / "a.laz", [[139.7, 35.6, 0.0], [139.8, 35.7, 1.0]], crs="EPSG:4326")
+    (tmp_path / "r.csv").write_text("lon,lat\n139.7,35.6\n139.7,35.6001\n")
+    with pytest.raises(PartialError, match=r"(?s)no source of the map.*: its CRS.*in degrees"):
+        ts.estimate(tmp_path / "a.laz", tmp_path / "r.csv", out=tmp_path / "run")

@@ -236,9 +236,9 @@ def show_update(folder: Files, update: dict[str, Any]) -> None:
         found = map_diff.diff(folder.address)
     except (UsageError, StoreError):  # of an older version: nothing is kept of before
         return
-    worse, limit = distance(float(found.worse["length"].sum())), cm_limit(found.limit)
+    places, road = count_of(len(found.worse), "place"), float(found.worse["length"].sum())
     why = f": `tilestream diff {folder.address}` says where and why" if len(found.worse) else ""
-    say(f"{worse} of road got worse by more than {limit}{why}")
+    say(f"{places}, {distance(road)} of road, got worse by more than {cm_limit(found.limit)}{why}")
 
 
 def not_estimated(report: dict[str, Any]) -> list[str]:

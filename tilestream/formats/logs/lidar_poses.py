@@ -15,6 +15,7 @@ from tilestream.formats.logs.poses import Edge
 from tilestream.records import Float64, Trajectory
 from tilestream.settings import LogOptions
 
+NO_POSES = f"no poses; a log needs {', '.join(ros.POSE_TYPES)} or {ros.TF} messages"
 MAP = "map"
 """The frame of the map by convention (ROS REP 105)."""
 VEHICLE = ("base_link", "base_footprint", "base")
@@ -319,10 +320,7 @@ def choose_poses(
             return topic.topic, of_lidar.of_topic(topic)
     moving = [t for t in tf if not t.static]
     if not moving:
-        raise PoseError(
-            f"{path}: no poses; a log needs {', '.join(ros.POSE_TYPES)} or {ros.TF} messages"
-            + (f" on {named}" if named else "")
-        )
+        raise PoseError(f"{path}: {NO_POSES}" + (f" on {named}" if named else ""))
     return named or moving[0].topic, of_lidar.of_tf(named or moving[0].topic)
 
 

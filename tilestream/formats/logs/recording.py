@@ -17,7 +17,7 @@ from tilestream.formats.logs import ros
 from tilestream.formats.logs.base import RecordedScan, Recording
 from tilestream.formats.logs.clouds import choose_clouds
 from tilestream.formats.logs.drivers import recorded_scan
-from tilestream.formats.logs.lidar_poses import choose_poses
+from tilestream.formats.logs.lidar_poses import NO_POSES, choose_poses
 from tilestream.formats.logs.messages import Message, MessageFile, OpenFile, Topic
 from tilestream.formats.logs.pose_tracks import PoseTrack
 from tilestream.records import Int64
@@ -135,9 +135,11 @@ def _pose_tracks(path: str, topics: Sequence[Topic], named: str | None) -> dict[
         if t.encoding in ros.ENCODINGS
         and (t.type == ros.TF or (t.type in ros.POSE_TYPES and named in (None, t.name)))
     }
+    there = ", ".join(f"{t.name} ({t.type or 'no type'})" for t in topics)
     if named is not None and named not in tracks:
-        there = ", ".join(f"{t.name} ({t.type or 'no type'})" for t in topics)
         raise PoseError(f"{path}: no poses on topic {named}; topics: {there}")
+    if not tracks:
+        raise PoseError(f"{path}: {NO_POSES}; topics: {there}")
     return tracks
 
 

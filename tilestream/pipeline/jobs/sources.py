@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from tilestream.crs import named, one_crs
-from tilestream.errors import SourceError, StoreNotFoundError, UsageError
+from tilestream.errors import PartialError, SourceError, StoreNotFoundError, UsageError
 from tilestream.files import place_of
 from tilestream.formats import files_of, matches_of, open_source
 from tilestream.formats.base import SourceInfo, Span
@@ -208,13 +208,19 @@ def crs_of_map(sources: Iterable[str], url: str, asked: str | None) -> str | Non
 
     Raises:
         SourceError, CrsError: as `ingest`.
+        PartialError: none of the files can be read; lists them.
     """
     try:
         return open_store(url).settings.crs
     except StoreNotFoundError:
-        named = list(_without_logs(sources))
+        every = list(sources)
+        named = list(_without_logs(every))
         settings = IngestSettings(crs=asked)
-        return with_crs(settings, examine_all(named, settings)).crs if named else asked
+        found = examine_all(named, settings) if named else []
+        reasons = {s.path: s.reason.removeprefix(f"{s.path}: ") for s in found if s.reason}
+        if reasons and len(reasons) == len(found) and len(named) == len(every):
+            raise PartialError(f"{url}: no source of the map can be read:", reasons) from None
+        return with_crs(settings, found).crs
 
 
 def _without_logs(sources: Iterable[str]) -> Iterator[str]:
