@@ -138,7 +138,8 @@ class Worth:
         if not (known(self.median) and known(self.low) and known(self.high)):
             return "The estimates have no interval." if known(self.median) else ""
         median, low, high = (cm_about(x, self.digits) for x in (self.median, self.low, self.high))
-        return f"The median estimate, {median}, has its {LEVEL:.0%} interval from {low} to {high}."
+        interval = f"{percent(LEVEL, 0)} interval from {low} to {high}"
+        return f"The median estimate, {median}, has its {interval}."
 
     def _outside(self) -> str:
         if not self.outside:
