@@ -357,7 +357,7 @@ def test_sources_that_all_fail_leave_the_map_as_it_was(tmp_path: Path) -> None:
     marks = ts.ingest(path, url, tile_size=10.0).marks()
     whole = path.read_bytes()
     path.write_bytes(whole[:-100])
-    with pytest.raises(PartialError, match=r"no source could be read.*\n.*a\.pcd: ") as caught:
+    with pytest.raises(PartialError, match=r"as it was:\n.*a\.pcd: ") as caught:
         ts.ingest(path, url, tile_size=10.0)
     store = ts.open_store(str(url))
     assert store.marks() == marks
@@ -366,6 +366,16 @@ def test_sources_that_all_fail_leave_the_map_as_it_was(tmp_path: Path) -> None:
     again = ts.ingest(path, url, tile_size=10.0)
     assert again.marks() == marks
     assert [source["reason"] for source in again.sources()] == [""]
+
+
+def test_of_a_map_that_never_was_nobody_says_that_it_is_as_it_was(tmp_path: Path) -> None:
+    path = tmp_path / "a.laz"
+    write_las(path, np.random.default_rng(5).uniform(0.0, 20.0, (1000, 3)))
+    content = bytearray(path.read_bytes())
+    content[-400:-200] = bytes(200)
+    path.write_bytes(content)
+    with pytest.raises(PartialError, match=r"no source could be read:\n"):
+        ts.ingest(path, tmp_path / "map.zarr")
 
 
 @pytest.mark.parametrize("place", [(2e8, 0.0, 0.0), (0.0, -2e8, 0.0), (0.0, 0.0, 2e6)])

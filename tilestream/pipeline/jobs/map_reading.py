@@ -262,9 +262,8 @@ class Reading:
         """Write down which tiles the map will have; the tasks that write those that differ."""
         if self.left_out and not wanted:
             self._record()
-            raise PartialError(
-                f"{self.store.url}: no source could be read, the map is as it was:", self.left_out
-            )
+            still = ", the map is as it was" if self.store.manifest is not None else ""
+            raise PartialError(f"{self.store.url}: no source could be read{still}:", self.left_out)
         made = {key: task for key, task in wanted.items() if key not in self._written}
         self.merges = Plan.of(made.values(), self._memory).tasks
         self.sorted_out = True
