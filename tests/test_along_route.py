@@ -97,6 +97,15 @@ def test_noise_falls_as_the_kernel_widens() -> None:
     assert spread[2] / spread[0] == pytest.approx(expected, rel=0.15)
 
 
+def test_a_route_may_have_a_name_of_several_columns() -> None:
+    """Two drives along the same routes, in one table, as each alone."""
+    one, two = (drives([0.3 * k + at for k in range(24)], [5], 2) for at in (0.0, 0.1))
+    both = pd.concat([one.assign(group="a"), two.assign(group="b")], ignore_index=True)
+    found = averaged_along(both.sample(frac=1.0, random_state=1), 1.5, by=("group", "route_id"))
+    alone = pd.concat([averaged_along(table, 1.5) for table in (one, two)], ignore_index=True)
+    pd.testing.assert_frame_equal(found.sort_index().drop(columns="group"), alone, check_exact=True)
+
+
 def test_places_far_apart_stand_for_themselves_and_no_width_changes_nothing() -> None:
     table = drives([0.0, 3.5, 7.0, 10.5], [], 1)
     pd.testing.assert_frame_equal(averaged_along(table, 1.5), table)

@@ -15,7 +15,7 @@ from tilestream.factors.along_route import WIDTH, WIDTHS
 from tilestream.model.corrected import WEIGHTS, Corrected
 from tilestream.model.dataset import TARGETS, Dataset
 from tilestream.model.evaluation import held_out
-from tilestream.model.physics import VIRTUAL, Physics, possible, width_of
+from tilestream.model.physics import VIRTUAL, Physics, at_each_width, possible, width_of
 from tilestream.model.prediction import predict
 from tilestream.model.splits import leave_path_out
 from tilestream.model.training import ESTIMATES, train
@@ -183,8 +183,9 @@ def test_the_kernel_is_as_wide_as_the_noise_asks_for(
     noise: float, expected: tuple[float, ...]
 ) -> None:
     world = with_virtual_drives(dataset(2, lengths=LENGTHS), noise=noise)
-    assert width_of(world) in expected
-    assert train(world, recipe="physics").width == width_of(world)
+    width = width_of(world, at_each_width(world))
+    assert width in expected
+    assert train(world, recipe="physics").width == width
 
 
 def test_the_kernel_is_chosen_on_what_trains(plain: Dataset) -> None:
@@ -199,8 +200,8 @@ def test_the_kernel_is_chosen_on_what_trains(plain: Dataset) -> None:
 
 def test_without_blocks_or_virtual_drives_the_kernel_is_the_usual_one() -> None:
     short = with_virtual_drives(dataset(2, lengths={"a": 120}))
-    assert width_of(short) == WIDTH
-    assert width_of(dataset(2, lengths={"a": 210, "b": 210})) == WIDTH
+    for world in (short, dataset(2, lengths={"a": 210, "b": 210})):
+        assert width_of(world, at_each_width(world)) == WIDTH
 
 
 def test_a_dataset_is_averaged_along_its_drives(plain: Dataset) -> None:

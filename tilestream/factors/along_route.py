@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from tilestream.factors.virtual_drive import PART_COLUMNS
-from tilestream.records import Float64
+from tilestream.records import Float64, Int64
 
 AVERAGED = tuple(column.name for column in PART_COLUMNS)
 """Columns that are averaged."""
@@ -27,7 +27,10 @@ SLACK = 1e-6
 
 
 def averaged_along(
-    places: pd.DataFrame, width: float, columns: Sequence[str] = AVERAGED
+    places: pd.DataFrame,
+    width: float,
+    columns: Sequence[str] = AVERAGED,
+    by: Sequence[str] = ("route_id",),
 ) -> pd.DataFrame:
     """The virtual drives of sample points, averaged with those of their neighbours on the route.
 
@@ -37,11 +40,11 @@ def averaged_along(
     outweighs the other, and the last point stands for itself.
 
     Args:
-        places: a row per sample point: `route_id`, `arc_length` [m], `status`, `columns`; an index
-            without repeats. The average of a point is right if all points of its route within
-            `CUT * width` of it are there.
+        places: a row per sample point: `by`, `arc_length` [m], `status`, `columns`. The average of
+            a point is right if all points of its route within `CUT * width` of it are there.
         width: of the kernel [m]; 0: the table is given back as it is.
         columns: what is averaged.
+        by: the columns that together name a route.
 
     Returns:
         The table, rows in the same order, `columns` of the points that are done as weighted means:
@@ -49,21 +52,25 @@ def averaged_along(
     """
     if width == 0.0:
         return places
-    averaged = places.copy()
-    done = places[places["status"] == "done"].sort_values("arc_length", kind="stable")
-    for _, route in done.groupby("route_id", sort=False):
-        arc = route["arc_length"].to_numpy(np.float64)
-        values = route[list(columns)].to_numpy(np.float64)
-        averaged.loc[route.index, list(columns)] = _of_route(arc, values, width)
-    return averaged
+    route = places.groupby(list(by), sort=False).ngroup().to_numpy().astype(np.int64)
+    arc = places["arc_length"].to_numpy(np.float64)
+    values = places[list(columns)].to_numpy(np.float64, copy=True)
+    done = np.flatnonzero((places["status"] == "done").to_numpy())
+    done = done[np.lexsort((arc[done], route[done]))]
+    values[done] = _means(route[done], arc[done], values[done], width)
+    return places.assign(**dict(zip(columns, values.T, strict=True)))
 
 
-def _of_route(arc: Float64, values: Float64, width: float) -> Float64:
-    """(n, k) weighted means of (n, k) values at (n,) rising arc lengths."""
+def _means(route: Int64, arc: Float64, values: Float64, width: float) -> Float64:
+    """(n, k) weighted means of (n, k) values at (n,) arc lengths that rise along each of the (n,)
+    rising routes.
+    """
     total, weights = values.copy(), np.ones(len(arc))
     rows = np.arange(len(arc))
+    first, end = np.searchsorted(route, route), np.searchsorted(route, route, "right")
+    pairs = np.minimum(rows - first, end - 1 - rows)
     for step in range(1, len(arc)):
-        rows = rows[(rows >= step) & (rows < len(arc) - step)]
+        rows = rows[pairs[rows] >= step]
         behind, ahead = arc[rows] - arc[rows - step], arc[rows + step] - arc[rows]
         paired = np.maximum(behind, ahead) <= CUT * width + SLACK
         rows = rows[paired]

@@ -43,13 +43,14 @@ def resampled_spearman(one: Float64, two: Float64, block: Int64, counts: Float64
         counts: (k, blocks) of `resampled`.
     """
     ranked = [np.unique(values, return_inverse=True) for values in (one, two)]
-    found = np.empty(len(counts))
-    for row, count in enumerate(counts):
+    drawn, row_of = np.unique(counts, axis=0, return_inverse=True)  # few blocks: often the same
+    found = np.empty(len(drawn))
+    for row, count in enumerate(drawn):
         weight = count[block]
         a, b = (_centred_ranks(places, len(values), weight) for values, places in ranked)
         spread = np.sqrt((weight @ (a * a)) * (weight @ (b * b)))
         found[row] = weight @ (a * b) / spread if spread > 0.0 else np.nan
-    return found
+    return found[row_of.ravel()]
 
 
 def _centred_ranks(places: Int64, count: int, weight: Float64) -> Float64:

@@ -139,8 +139,7 @@ class Dataset:
         if seen.empty:
             return self
         keys, names = ["group", "sample"], list(AVERAGED)
-        drives = [averaged_along(drive, width) for _, drive in seen.groupby("group")]
-        found = pd.concat(drives).set_index(keys)[names]
+        found = averaged_along(seen, width, names, ("group", "route_id")).set_index(keys)[names]
         here = found.reindex(pd.MultiIndex.from_frame(self.rows[keys]))
         columns = {name: here[name].to_numpy(np.float64) for name in names}
         return replace(self, rows=self.rows.assign(**columns))

@@ -9,7 +9,7 @@ import pandas as pd
 from tilestream.errors import ModelError
 from tilestream.model.dataset import Dataset
 from tilestream.model.figures import FIGURES, difference, with_spans
-from tilestream.model.physics import width_of
+from tilestream.model.physics import at_each_width, width_of
 from tilestream.model.registry import COMPETITORS
 from tilestream.model.regressor import Regressor
 from tilestream.model.splits import Split, block_splits, protocols_of
@@ -45,10 +45,12 @@ def held_out(
         several runs `Dataset.streets` and `pieces`: what must not calibrate itself), `arc_length`
         [m], `actual`, `estimate`, `median` (of the training part).
     """
+    seen = at_each_width(dataset)
     parts = []
     for split in splits:
         # The width too is chosen on what trains.
-        averaged = dataset.averaged(width_of(dataset.take(split.train)))
+        width = width_of(dataset.take(split.train), seen[split.train])
+        averaged = dataset.averaged(width)
         train, test = averaged.take(split.train), averaged.take(split.test)
         part = test.rows[["group", "path", "block", "arc_length"]].assign(
             path=test.streets,

@@ -151,14 +151,27 @@ def possible(target: str, values: Float64, places: pd.DataFrame) -> Float64:
     return share
 
 
-def width_of(dataset: Dataset) -> float:
+def at_each_width(dataset: Dataset) -> Float64:
+    """(n, k) what the virtual drive says of `error_mean`, averaged with each of the k `WIDTHS`;
+    (n, 0) where there is no virtual drive.
+    """
+    column = VIRTUAL["error_mean"]
+    if dataset.virtual_drives.empty or column not in dataset.rows:
+        return np.empty((len(dataset), 0))
+    return np.column_stack([dataset.averaged(width).rows[column] for width in WIDTHS])
+
+
+def width_of(dataset: Dataset, seen: Float64) -> float:
     """The kernel along the route with which physics estimates held-out blocks best [m].
 
     The candidate with the least mean absolute error of `error_mean`, of equals the narrowest;
     `WIDTH` where no block can be held out, or where there is no virtual drive.
+
+    Args:
+        dataset: labelled places.
+        seen: (n, k) their rows of `at_each_width`: found once where parts of a dataset train.
     """
-    column = VIRTUAL["error_mean"]
-    if dataset.virtual_drives.empty or column not in dataset.rows:
+    if not seen.size:
         return WIDTH
     try:
         splits = block_splits(dataset)
@@ -166,11 +179,10 @@ def width_of(dataset: Dataset) -> float:
         return WIDTH
     label = dataset.label("error_mean")
     errors = []
-    for width in WIDTHS:
-        seen = dataset.averaged(width).rows[column].to_numpy(np.float64)
+    for virtual in seen.T:
         off = np.empty(len(label))
         for split in splits:
-            added = np.median((label - seen)[split.train])
-            off[split.test] = np.maximum(seen[split.test] + added, 0.0) - label[split.test]
+            added = np.median((label - virtual)[split.train])
+            off[split.test] = np.maximum(virtual[split.test] + added, 0.0) - label[split.test]
         errors.append(np.abs(off).mean())
     return WIDTHS[int(np.argmin(errors))]

@@ -23,7 +23,7 @@ from tilestream.model.intervals import (
     stretch,
     wider_for_few,
 )
-from tilestream.model.physics import Physics, width_of
+from tilestream.model.physics import Physics, at_each_width, width_of
 from tilestream.model.registry import DEFAULT, OF_VIRTUAL_DRIVES, REGRESSORS
 from tilestream.model.regressor import Regressor, held_out_estimates
 from tilestream.model.splits import block_splits, leave_lidar_out
@@ -154,7 +154,7 @@ def train(
         )
     regressor = REGRESSORS[recipe]
     dataset.check(MAIN)
-    width = width_of(dataset)
+    width = width_of(dataset, at_each_width(dataset))
     dataset = dataset.averaged(width)
     pieces = dataset.rows.groupby(["path", dataset.rows["arc_length"] // PIECE]).ngroups
     whole, dataset = dataset, dataset.with_columns(regressor.features(dataset.columns))
