@@ -1,14 +1,21 @@
 """Three short streets, far apart on one map, and a drive along each: a whole job in miniature."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 
 import logs
 import numpy as np
+import pytest
 from logs import SECOND, START, pose
 from scenes import PLACES, in_map
 
 from tilestream.formats.points.pcd import write_pcd
+from tilestream.model import forest, registry
+from tilestream.model.forest import Growth, PaperForest
 from tilestream.pipeline.jobs.run_settings import RunSettings
+from tilestream.report import pictures
 
 STREETS = {"canyon": 0.0, "tunnel": 400.0, "crossing": 800.0}
 """Kind of each street, and where it begins [m, map x]."""
@@ -56,3 +63,17 @@ def job(folder: Path, out: Path, **changes: object) -> RunSettings:
         "model": {"recipe": "forest"},
     }
     return RunSettings(**(values | changes))
+
+
+@contextmanager
+def small(cache: Path) -> Iterator[None]:
+    """Five trees instead of a hundred, coarse pictures: for tests that are about the job. What they
+    learn of costs stays in a folder of their own.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(cache))
+        patch.setattr(PaperForest, "defaults", asdict(Growth(trees=5)))
+        patch.setattr(forest, "CANDIDATES", (Growth(trees=4, leaf=2, log=True),))
+        patch.delitem(registry.COMPETITORS, "mlp")  # a thousand passes over the data
+        patch.setattr(pictures.png, "__defaults__", (20,))
+        yield

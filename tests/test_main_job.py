@@ -11,7 +11,7 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -37,10 +37,9 @@ from tilestream.errors import (
 )
 from tilestream.factors.along_route import averaged_along
 from tilestream.files import Files
-from tilestream.model import evaluation, forest, registry, training
+from tilestream.model import evaluation, registry, training
 from tilestream.model.dataset import TARGETS
 from tilestream.model.file import load_model, save_model
-from tilestream.model.forest import Growth, PaperForest
 from tilestream.model.intervals import coverage
 from tilestream.model.prediction import predict
 from tilestream.model.training import PREDICTION_COLUMNS
@@ -60,7 +59,6 @@ from tilestream.pipeline.jobs.run_settings import ModelSettings, RunSettings, re
 from tilestream.pipeline.stages import predict as predict_stage
 from tilestream.pipeline.stages.map_plan import MapPlan
 from tilestream.pipeline.stages.terms import terms
-from tilestream.report import pictures
 from tilestream.report.evaluation import MODELS
 from tilestream.settings import (
     CoarseSettings,
@@ -98,15 +96,7 @@ class Told:
 
 @pytest.fixture(scope="module", autouse=True)
 def small_forests(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Five trees instead of a hundred, coarse pictures: these tests are about the job. What they
-    learn of costs stays here.
-    """
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        patch.setattr(PaperForest, "defaults", asdict(Growth(trees=5)))
-        patch.setattr(forest, "CANDIDATES", (Growth(trees=4, leaf=2, log=True),))
-        patch.delitem(registry.COMPETITORS, "mlp")  # a thousand passes over the data
-        patch.setattr(pictures.png, "__defaults__", (20,))
+    with streets.small(tmp_path_factory.mktemp("cache")):
         yield
 
 

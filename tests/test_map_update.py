@@ -28,7 +28,6 @@ from tilestream.formats.points.pcd import write_pcd
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.jobs.map_reading import GONE
 from tilestream.pipeline.jobs.run_settings import RunSettings
-from tilestream.report import pictures
 
 TILE = 20.0
 BLOCKS = 8
@@ -36,11 +35,8 @@ BLOCKS = 8
 
 
 @pytest.fixture(scope="module", autouse=True)
-def own_caches(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """What these tests learn of costs stays here; their pictures are coarse."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        patch.setattr(pictures.png, "__defaults__", (20,))
+def small_jobs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    with streets.small(tmp_path_factory.mktemp("cache")):
         yield
 
 
