@@ -74,6 +74,8 @@ from tilestream.simulation.settings import load_preset
 PIPELINES = Path(__file__).resolve().parents[1] / "pipelines"
 
 
+SEEING = {"range_max": 14.0, "starts": 8, "draws": 2, "worlds": 1}
+"""Virtual drives of few scans and starts."""
 LEARNT = ("samples", "evaluate", "importance", "train", "predict")
 """Stages after measuring."""
 
@@ -298,13 +300,16 @@ def test_a_drive_that_is_left_out_leaves_nothing_behind(inputs: Path, copy: Path
     assert set(places["route_id"]) == {"canyon", "tunnel"}
 
 
-def test_a_changed_block_redoes_what_sees_it(inputs: Path, copy: Path, tmp_path: Path) -> None:
+def test_a_changed_block_redoes_what_sees_it(
+    inputs: Path, done: tuple[Path, Told], tmp_path: Path
+) -> None:
     changed = tmp_path / "changed"
     shutil.copytree(inputs, changed)
-    ts.run(job(changed, tmp_path / "run"))
+    settings = job(changed, tmp_path / "run", model={"use": str(done[0] / "model.skops")})
+    ts.run(settings)
     streets.write_pcd(changed / "map_tunnel.pcd", streets.street("tunnel", 2, 0.3))
     told = Told()
-    ts.run(job(changed, tmp_path / "run"), watch=told)
+    ts.run(settings, watch=told)
     redone = {o.key.split("-")[1] for o in told.outcomes if o.stage == "register" and o.made}
     assert redone == {"tunnel"}
     tiles = {
@@ -480,7 +485,7 @@ def test_the_thinning_of_a_map_that_is_there_counts(
 def test_observability_joins_the_factors(inputs: Path, copy: Path) -> None:
     told = Told()
     model = {"recipe": "corrected"}
-    ts.run(job(inputs, copy, observe={"range_max": 14.0}, model=model), watch=told)
+    ts.run(job(inputs, copy, observe=SEEING, model=model), watch=told)
     assert {"surfels", "observe"} <= {outcome.stage for outcome in told.outcomes}
     assert told.worked() == set(LEARNT)
     dataset = dataset_of(copy)
@@ -550,7 +555,7 @@ def test_physics_needs_no_drive(inputs: Path, tmp_path: Path) -> None:
         tmp_path / "run",
         drives=[],
         routes=routes,
-        observe={"range_max": 14.0},
+        observe=SEEING,
         model=model,
         label={"matcher": "default"},
     )
@@ -573,9 +578,8 @@ def test_physics_of_a_short_drive_is_the_virtual_drive_as_it_is_and_says_so(
 ) -> None:
     """With 26 places nothing is fitted, and what was measured stands beside the estimates."""
     drives = [{"log": str(inputs / "canyon.mcap")}]
-    seeing = {"range_max": 14.0, "starts": 8}
     model = {"recipe": "physics"}
-    ts.run(job(inputs, tmp_path / "run", drives=drives, observe=seeing, model=model))
+    ts.run(job(inputs, tmp_path / "run", drives=drives, observe=SEEING, model=model))
     told = json.loads((tmp_path / "run" / "run.json").read_text())
     assert any("26 places are measured" in note for note in told["notes"]["job"])
     places = pd.read_parquet(tmp_path / "run" / "report" / "places.parquet")
@@ -860,8 +864,12 @@ def config(inputs: Path, done: tuple[Path, Told], tmp_path: Path) -> Path:
 
 
 def test_the_command_prints_the_headline_and_gates(
-    config: Path, capsys: pytest.CaptureFixture[str]
+    inputs: Path, elsewhere: dict[str, object], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    routes = {"routes": [str(inputs / f"{kind}.mcap") for kind in STREETS]}
+    settings = job(inputs, tmp_path / "run", **(elsewhere | routes))
+    config = tmp_path / "job.yaml"
+    config.write_text(yaml.safe_dump(settings.model_dump(mode="json")))
     assert command(["run", str(config), "--workers", "1"]) == 0
     said = capsys.readouterr().out
     assert "The report is at" in said
