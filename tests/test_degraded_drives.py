@@ -9,6 +9,7 @@ import pytest
 from streets import job, street, write_drive
 
 import tilestream as ts
+from tilestream.apps.scene import route_of
 from tilestream.errors import UsageError
 from tilestream.factors.along_route import AVERAGED, WIDTH, averaged_along
 from tilestream.formats.points.pcd import write_pcd
@@ -149,6 +150,9 @@ def test_a_drive_of_a_lesser_lidar_trains_nothing(
     assert found["both"][0] == ["whole"]
     np.testing.assert_array_equal(found["both"][2], found["whole"][2])
     assert set(ts.read_run(tmp_path / "both")["drive"].dropna()) == {"whole"}
+    seen = [route_of(tmp_path / name)[1:3] for name in ("both", "whole")]
+    for of_both, of_whole in zip(*seen, strict=True):
+        np.testing.assert_array_equal(of_both, of_whole)
 
 
 def test_what_is_held_out_stays_with_its_label() -> None:

@@ -976,7 +976,11 @@ def test_costs_are_learnt_from_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     learn([task], [Outcome("terms-1", "terms", made=False, seconds=80.0)])
     assert core_hours([task])["terms"] == before
     learn([task], [Outcome("terms-1", "terms", made=True, seconds=80.0)])
-    assert core_hours([task])["terms"] == pytest.approx((before + 80.0 / 3600.0) / 2.0)
+    learnt = core_hours([task])["terms"]
+    assert learnt == pytest.approx((before * 80.0 / 3600.0) ** 0.5)
+    small = Task(terms, "2", TileArrays("nowhere", ts.TileKey(0, 0), "terms"), work=1)
+    learn([small], [Outcome("terms-2", "terms", made=True, seconds=0.1)])  # a hundredth of enough
+    assert 0.98 * learnt < core_hours([task])["terms"] < learnt
     calibration_file().write_text("{broken")
     assert core_hours([task])["terms"] == before
 

@@ -11,7 +11,7 @@ from tilestream.errors import ModelError, UsageError
 from tilestream.model.dataset import TARGETS, Dataset, made_with, nearest_along
 from tilestream.model.evaluation import factor_sets
 from tilestream.model.features import features_of, with_derived
-from tilestream.model.join import NOWHERE, PLACE, join
+from tilestream.model.join import NOWHERE, ON_PATH, PLACE, join, nearest_pass
 from tilestream.model.splits import PROTOCOLS, block_splits, leave_path_out, random_split
 from tilestream.records import Column
 from tilestream.sensor import VLP16
@@ -305,6 +305,41 @@ def test_the_nearest_along_a_path_is_that_of_a_search(
             assert abs(at - arc) == min(apart)
         else:
             assert np.isnan(at)
+
+
+@given(
+    st.lists(
+        st.tuples(st.floats(-9.0, 9.0), st.floats(-9.0, 9.0), st.floats(-4.0, 4.0)),
+        min_size=1,
+        max_size=12,
+    ),
+    st.lists(
+        st.tuples(st.floats(-9.0, 9.0), st.floats(-9.0, 9.0), st.floats(-4.0, 4.0)), max_size=6
+    ),
+)
+def test_a_place_lies_on_the_pass_that_heads_its_way(
+    route: list[tuple[float, float, float]], places: list[tuple[float, float, float]]
+) -> None:
+    way, at = np.array(route), np.array(places).reshape(-1, 3)
+    rows, distance = nearest_pass(way[:, :2], way[:, 2], at[:, :2], at[:, 2])
+    for (x, y, heading), row, found in zip(at, rows, distance, strict=True):
+        apart = np.hypot(way[:, 0] - x, way[:, 1] - y)
+        same = (np.cos(way[:, 2] - heading) >= 0.0) & (apart <= ON_PATH)
+        assert found == pytest.approx(apart[row])
+        assert found == pytest.approx((apart[same] if same.any() else apart).min())
+
+
+def test_labels_of_a_street_driven_both_ways_stay_on_their_way() -> None:
+    factors, labels = drives(3, {"a": 40})
+    back = {"x": labels["x"], "arc_length": 100.0 + labels["arc_length"].to_numpy()[::-1]}
+    turn = labels["heading"] + np.pi
+    routes = factors[list(PLACE)]
+    both = pd.concat([routes, routes.assign(**back, heading=turn)], ignore_index=True)
+    for offset, arc in ((0.0, labels["arc_length"]), (np.pi, back["arc_length"])):
+        headed = {"heading": labels["heading"] + offset}
+        one = join(both, {"d": factors.assign(**headed)}, {"d": labels}, COLUMNS)
+        rows = one.rows.sort_values("sample")
+        assert rows["arc_length"].tolist() == pytest.approx(list(arc))
 
 
 def test_broken_tables_are_refused(short: tuple[pd.DataFrame, pd.DataFrame]) -> None:

@@ -128,8 +128,10 @@ def test_what_is_no_run_or_not_whole_is_refused(folder: Path, tmp_path: Path) ->
 def test_a_label_stands_at_its_nearest_place_or_for_itself(
     places: list[tuple[int, int]], labels: list[tuple[int, int]]
 ) -> None:
-    frame = pd.DataFrame(places, columns=["x", "y"]).assign(z=0.0, route_id="r", estimate=1.0)
-    told = pd.DataFrame(labels, columns=["x", "y"]).assign(z=0.0, drive="d")
+    frame = pd.DataFrame(places, columns=["x", "y"]).assign(
+        z=0.0, heading=0.0, route_id="r", estimate=1.0
+    )
+    told = pd.DataFrame(labels, columns=["x", "y"]).assign(z=0.0, heading=0.0, drive="d")
     told["error_mean"] = np.arange(len(told)) + 0.5
     table = with_labels(frame, told)
     here, rest = table.iloc[: len(frame)], table.iloc[len(frame) :]

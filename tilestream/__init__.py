@@ -63,6 +63,7 @@ if TYPE_CHECKING:
     from tilestream.pipeline.jobs.starts_of import starts_of
     from tilestream.pipeline.jobs.train_over import train_over
     from tilestream.pipeline.jobs.unfit import unfit
+    from tilestream.pipeline.stages.drive_scans import Reading
     from tilestream.records import Cells, Column, LocalizationError, Registrations, Route
     from tilestream.registration import register
     from tilestream.sensor import HDL64, OS1_128, VLP16, Sensor
@@ -80,6 +81,7 @@ __all__ = [
     "Covariances",
     "LocalizationError",
     "LogOptions",
+    "Reading",
     "RegistrationSettings",
     "Registrations",
     "Route",
@@ -169,6 +171,7 @@ _LATE = {
     "pipeline.jobs.starts_of": ("starts_of",),
     "pipeline.jobs.train_over": ("train_over",),
     "pipeline.jobs.unfit": ("unfit",),
+    "pipeline.stages.drive_scans": ("Reading",),
     "records": ("Cells", "Column", "LocalizationError", "Registrations", "Route"),
     "registration": ("register",),
     "sensor": ("HDL64", "OS1_128", "Sensor", "VLP16"),

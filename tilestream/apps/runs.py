@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.spatial import cKDTree
 
 from tilestream.apps.run_plot import ESTIMATED, plot_places
 from tilestream.bounded_yaml import parse_yaml
@@ -30,7 +29,7 @@ from tilestream.errors import (
 )
 from tilestream.factors.rows import PLACE_COLUMNS
 from tilestream.files import Files, place_of
-from tilestream.model.join import ON_PATH
+from tilestream.model.join import ON_PATH, nearest_pass
 from tilestream.model.training import ESTIMATES, MAIN
 from tilestream.notebook import html_of
 from tilestream.pipeline.jobs.run_book import ENDED, content_as_written
@@ -95,7 +94,9 @@ def read_run(place: str | os.PathLike[str]) -> pd.DataFrame:
         >>> table[["sample", "measured", "estimate"]].iloc[:2].to_numpy().tolist()
         [[0.0, nan, 0.1], [1.0, 0.3, 0.2]]
     """
-    table = with_labels(places_of(place), _labels(place))
+    labels = labels_of(place)
+    done = labels[labels["status"] == "done"].reset_index(drop=True) if len(labels) else labels
+    table = with_labels(places_of(place), done)
     if table.empty and not len(table.columns):
         raise SourceNotFoundError(f"{place}: no tables of a run; `ts.run` writes some")
     first = [name for name in (*PLACE, *OF_LABEL, *ESTIMATED) if name in table]
@@ -160,8 +161,8 @@ def places_of(place: str | os.PathLike[str]) -> pd.DataFrame:
     return found
 
 
-def _labels(place: str | os.PathLike[str]) -> pd.DataFrame:
-    """The measured places, with the drive of each; of a job none that was seen with another lidar
+def labels_of(place: str | os.PathLike[str]) -> pd.DataFrame:
+    """The labels of a run, with the drive of each; of a job none that was seen with another lidar
     than that of its estimates, or that does not fit the map.
     """
     unfit = record_of(Files.at(place)).get("unfit", {})
@@ -172,8 +173,7 @@ def _labels(place: str | os.PathLike[str]) -> pd.DataFrame:
             continue
         rows = read_tables([path])
         tables.append(rows.assign(drive="" if group == "errors" else group))
-    rows = pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
-    return rows[rows["status"] == "done"].reset_index(drop=True) if len(rows) else rows
+    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
 
 def _otherwise(place: str | os.PathLike[str]) -> list[str]:
@@ -196,10 +196,11 @@ def settings_of(place: str | os.PathLike[str]) -> RunSettings | None:
 
 
 def with_labels(places: pd.DataFrame, labels: pd.DataFrame) -> pd.DataFrame:
-    """Places with what was measured at each: the nearest label within `ON_PATH`.
+    """Places with what was measured at each: the nearest label within `ON_PATH`, of the way
+    there and not of that back (`nearest_pass`).
 
     Args:
-        places: with `x`, `y`, `z` [m]; may be empty.
+        places: with `x`, `y`, `z` [m] and `heading` [rad]; may be empty.
         labels: likewise, with `drive` and the labels (`MEASURED`), all finite; may be empty.
 
     Returns:
@@ -216,8 +217,9 @@ def with_labels(places: pd.DataFrame, labels: pd.DataFrame) -> pd.DataFrame:
         where = places[["x", "y", "z"]].to_numpy(np.float64)
         known = np.flatnonzero(np.isfinite(where).all(axis=1))
     if known.size:
-        near, row = cKDTree(where[known] - at[0]).query(at - at[0])
-        distance, nearest = np.asarray(near), known[np.asarray(row)]
+        along, heading = (t["heading"].to_numpy(np.float64) for t in (places, labels))
+        row, distance = nearest_pass(where[known], along[known], at, heading)
+        nearest = known[row]
     told = told.assign(measured_distance=np.where(distance <= ON_PATH, distance, np.nan))
     here = told[distance <= ON_PATH].set_index(nearest[distance <= ON_PATH])
     here = here.sort_values("measured_distance", kind="stable")

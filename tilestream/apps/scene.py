@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from tilestream.apps.changes import SAME_PLACE
+from tilestream.apps.runs import labels_of
 from tilestream.errors import TileNotReadyError, UsageError
 from tilestream.factors.stations import INTERPOLATED
 from tilestream.grid import MM_PER_M, Box, TileKey
@@ -157,14 +158,16 @@ def _inside(box: Box, at: Float64) -> NDArray[np.bool_]:
 def route_of(
     place: str | os.PathLike[str],
 ) -> tuple[Float64, Float64, NDArray[np.bool_], NDArray[np.bool_]]:
-    """The places of a run with what is known of their error; none for a tile store.
+    """The places of a run with what is known of their error, measured with the vehicle's lidar or
+    estimated; none for a tile store.
 
     Returns:
         (k, 3) places of the lidar [m, map frame], (k,) measured errors, else estimates, else NaN
         [m], (k,) whether measured, (k,) whether interpolated. Places without a position are left
         out.
     """
-    measured = _places(rows_of(place, "errors"), "error_mean")
+    labels = labels_of(place)
+    measured = _places(labels if len(labels) else None, "error_mean")
     estimated = _places(rows_of(place, "predictions"), "estimate")
     unknown = [_places(rows_of(place, "factors")), *(t[_lost(t)] for t in (measured, estimated))]
     measured, estimated = (t[~_lost(t)] for t in (measured, estimated))

@@ -8,10 +8,11 @@ import pandas as pd
 from scipy.spatial import cKDTree
 
 from tilestream.errors import UsageError
+from tilestream.kernels.fixed_order import norms
 from tilestream.model.dataset import TARGETS, Dataset
 from tilestream.model.features import features_of, with_derived
 from tilestream.moments import NEAR_COLUMNS
-from tilestream.records import Column, Float64
+from tilestream.records import Column, Float64, Int64
 
 PLACE = ("route_id", "arc_length", "x", "y", "z", "heading")
 """Columns that say where a row is; never features."""
@@ -48,9 +49,9 @@ def join(
     """Join each label with the factors of its own place, and name the path that it lies on.
 
     The path is the route that is nearest, if within 5 m horizontally, and `arc_length` that of the
-    route there; else the drive itself. Every label that is not joined is counted with its reason:
-    it failed, a value is NaN, no factors at its place, or no other labelled place on its path: the
-    end of a side street makes no path that could be held out.
+    route there (`nearest_pass`); else the drive itself. Every label that is not joined is counted
+    with its reason: it failed, a value is NaN, no factors at its place, or no other labelled place
+    on its path: the end of a side street makes no path that could be held out.
 
     Args:
         routes: sample points of the routes: place columns (`PLACE`).
@@ -149,11 +150,10 @@ def _with_paths(table: pd.DataFrame, paths: pd.DataFrame) -> pd.DataFrame:
     known = np.isfinite(at).all(axis=1)
     route = paths[["x", "y"]].to_numpy(np.float64)
     distance, nearest = np.full(len(at), np.inf), np.zeros(len(at), np.int64)
-    if known.any():
-        tree = cKDTree(route - route[0])
-        distance[known], nearest[known] = tree.query(at[known] - route[0])
+    along, heading = (t["heading"].to_numpy(np.float64) for t in (paths, table))
+    nearest[known], distance[known] = nearest_pass(route, along, at[known], heading[known])
     row = paths.iloc[nearest].reset_index(drop=True)
-    ahead = _ahead(at - route[nearest], row["heading"].to_numpy(np.float64))
+    ahead = _ahead(at - route[nearest], along[nearest])
     on = distance <= ON_PATH
     own = table["arc_length"].to_numpy(np.float64)
     return table.assign(
@@ -161,6 +161,35 @@ def _with_paths(table: pd.DataFrame, paths: pd.DataFrame) -> pd.DataFrame:
         arc_length=np.where(on, row["arc_length"].to_numpy(np.float64) + ahead, own),
         distance=np.where(on, distance, np.nan),
     )
+
+
+def nearest_pass(
+    route: Float64, along: Float64, at: Float64, heading: Float64
+) -> tuple[Int64, Float64]:
+    """The place of a route that each of some places lies at: the nearest, but where the route
+    passes there and back, of those within `ON_PATH` the nearest that heads the same way, within a
+    right angle.
+
+    Args:
+        route: (k, d) places of the route [m], k > 0.
+        along: (k,) headings there [rad].
+        at: (n, d) places [m].
+        heading: (n,) headings there [rad]; NaN: not known.
+
+    Returns:
+        (n,) rows of the route, and (n,) distances from there [m].
+    """
+    tree = cKDTree(route - route[0])
+    found, rows = tree.query(at - route[0])
+    distance, nearest = np.asarray(found, np.float64), np.asarray(rows, np.int64)
+    against = (np.cos(along[nearest] - heading) < 0.0) & (distance <= ON_PATH)
+    for place in np.flatnonzero(against):
+        near = np.array(tree.query_ball_point(at[place] - route[0], ON_PATH))
+        same = near[np.cos(along[near] - heading[place]) >= 0.0]
+        if len(same):
+            apart = norms(route[same] - at[place])
+            nearest[place], distance[place] = same[np.argmin(apart)], apart.min()
+    return nearest, distance
 
 
 def _ahead(offset: Float64, heading: Float64) -> Float64:

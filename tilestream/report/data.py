@@ -154,7 +154,8 @@ class Findings:
             _require(self.labels, LABEL_COLUMNS, "labels")
             labels = self.labels.drop_duplicates()
             object.__setattr__(self, "labels", labels)
-            again = labels.duplicated(["group", "path", "arc_length"])
+            at = ["group", "path", "arc_length", *(["sample"] if "sample" in labels else [])]
+            again = labels.duplicated(at)
             if again.any():
                 row = labels[again].iloc[0]
                 raise UsageError(

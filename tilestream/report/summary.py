@@ -164,7 +164,7 @@ def cards(content: Mapping[str, Any]) -> list[tuple[str, str]]:
         (evaluated, "places evaluated"),
         *([(thousands(between), "places interpolated between these")] if between else []),
         *([of_drives] if drives else []),
-        (thousands(head["labelled"]), "measured errors to train on and to judge by"),
+        (thousands(head["labelled"]), "measured errors, of all drives"),
         (thousands(head["missing"]), missing),
     ]
 
@@ -245,13 +245,14 @@ def paths(found: Findings) -> list[dict[str, Any]]:
     for name, part in found.labels.groupby("path", sort=True):
         actual, held = (part[c].to_numpy(np.float64) for c in ("error_mean", "held_out"))
         evaluated = np.isfinite(actual) & np.isfinite(held)
+        known_of = actual[evaluated] if evaluated.any() else actual
         row = {
             "path": str(name),
             "points": len(part),
             "groups": sorted(set(part["group"].astype(str))),
             "judged": int(evaluated.sum()),
             "interval": bool(part["low"].notna().any()),
-            "actual_median": float(np.nanmedian(actual)),
+            "actual_median": float(np.nanmedian(known_of)),
             "estimate_median": float(np.median(held[evaluated])) if evaluated.any() else None,
             **dict.fromkeys(OF_PATH),
         }

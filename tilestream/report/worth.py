@@ -16,6 +16,8 @@ NOWHERE = "nowhere"
 """Where estimates may have been checked, what proves most first."""
 HELD_OUT = "on what was held out of its training"
 """Where the error of a model was found that was checked otherwise elsewhere."""
+FEW = 10
+"""Places below which a check tells nothing: a rank correlation of three is 1 or -1 by luck."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +118,8 @@ class Worth:
         )
         said = f"Checked on {self.checked}"
         said += f": {there}" if there else ""
+        if self.places is not None and self.places < FEW:
+            return f"{said}: too few to tell how well."
         if self.spearman is not None:
             said += f"; rank correlation with what was measured {self.spearman:.2f}"
             if known(self.spearman_low) and known(self.spearman_high):

@@ -14,6 +14,10 @@ from tilestream.user_cache import user_cache
 
 LEAST = 0.03
 """Tasks that took less tell nothing [s]."""
+ENOUGH = 10.0
+"""Work of a stage that counts in full [s]; less of it, with what each task costs besides, counts as
+much less.
+"""
 
 
 def calibration_file() -> Path:
@@ -31,7 +35,9 @@ def seconds_per_work() -> dict[str, float]:
 
 
 def learn(tasks: Collection[Task], outcomes: Iterable[Outcome]) -> None:
-    """Take the times of a run into the figures, half new and half old; a full disk is no error."""
+    """Take the times of a run into the figures: their geometric mean with the old ones, of little
+    work less than half of it. A full disk is no error.
+    """
     work = {task.key: task.work for task in tasks}
     seconds: dict[str, float] = {}
     units: dict[str, int] = {}
@@ -43,8 +49,9 @@ def learn(tasks: Collection[Task], outcomes: Iterable[Outcome]) -> None:
     known = seconds_per_work()
     for stage, count in units.items():
         if count:
-            fresh = seconds[stage] / count
-            known[stage] = (known.get(stage, shipped[stage]) + fresh) / 2.0
+            share = 0.5 * min(1.0, seconds[stage] / ENOUGH)
+            old, fresh = known.get(stage, shipped[stage]), seconds[stage] / count
+            known[stage] = old ** (1.0 - share) * fresh**share
     place = calibration_file()
     try:
         Files.at(place).write(json.dumps(known, indent=2, sort_keys=True).encode())

@@ -82,7 +82,8 @@ def localize(
         true_pose: `log`, or `refined` as the paper does.
         scans_per_point: scans that are measured at each sample point, where there are as many.
         scans: which scans to use; default all.
-        reading: how the log is read (topics, as if by a simpler sensor); its path is `log`.
+        reading: how the log is read (topics, as if by a simpler sensor: `ts.Reading`); its path is
+            `log`.
         starts_per_task: splits the starts of a slice over several tasks; None: all in one.
         client: a Dask client to run on; None: this process.
         memory: what a task may use [bytes].

@@ -47,7 +47,8 @@ def train_over(
 
     Raises:
         SourceNotFoundError: no run directory there, or none with a dataset.
-        UsageError: no run, a district of an unknown run, or a recipe that does not know the lidar.
+        UsageError: no run, one that is named twice, a district of an unknown run, or a recipe that
+            does not know the lidar.
         ModelError: runs that differ in what must be equal (`over_runs`), or too few places.
     """
     dataset = dataset_over(runs, districts)
@@ -68,6 +69,10 @@ def dataset_over(
     unknown = sorted(set(named) - set(runs))
     if unknown:
         raise UsageError(f"districts has {', '.join(unknown)}, and no run is named so")
+    places = [of if isinstance(of, Dataset) else place_of(of) for of in runs.values()]
+    for number, place in enumerate(places):
+        if any(place is other or place == other for other in places[:number]):
+            raise UsageError(f"runs names {place} twice: its labels would count twice")
     return over_runs({name: _run(of, named.get(name)) for name, of in runs.items()})
 
 

@@ -23,7 +23,12 @@ from tilestream.settings import LogOptions
 
 @dataclass(frozen=True)
 class Reading:
-    """How a log is read: its topics and frames, as if by which sensor."""
+    """How a log is read: its topics and frames, as if by which sensor.
+
+    Examples:
+        >>> ts.Reading("drive.mcap", beams=16, range_max=30.0).as_sensor
+        '16 beams, 30 m'
+    """
 
     path: str
     """The log."""

@@ -205,7 +205,7 @@ MAKERS = (factors_drive, observe_drive, register, label)
 
 @stage(
     "samples",
-    version=7,
+    version=8,
     memory=lambda counts: FOREST_BYTES + BYTES_PER_ROW * counts["places"],
     seconds=0.001,
 )
