@@ -1,6 +1,7 @@
 """Where the commands print: facts on stdout, errors and what happens meanwhile on stderr."""
 
 import json
+import os
 import sys
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -10,6 +11,8 @@ from rich.segment import Segment
 
 from tilestream.notes import Notes, shared
 
+OF_FILES = 160
+"""Characters of a line where nobody knows: in a file or a pipe no table cuts its words."""
 BIDIRECTIONAL = "\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"
 """Characters that change in which order others are shown."""
 SHOWN_AS = {
@@ -35,6 +38,8 @@ class _Console(Console):
 
     def __init__(self, **how: Any) -> None:
         super().__init__(markup=False, emoji=False, **how)
+        if not self.is_terminal and "COLUMNS" not in os.environ:
+            self.width = OF_FILES
 
     def render(self, renderable: Any, options: Any = None) -> Iterable[Segment]:
         """All that is printed passes here: lines, tables, progress, log lines, tracebacks."""
