@@ -66,6 +66,7 @@ from tilestream.pipeline.stages.samples import places_with_factors
 from tilestream.pipeline.stages.train import ModelInUse
 from tilestream.report import Findings
 from tilestream.report.exports.tables import write_geoparquet
+from tilestream.settings import PREDICTION_ERROR
 
 REPEATS = 3
 
@@ -118,7 +119,7 @@ def tasks_of(run_dir: Path, out: Path) -> list[Task]:
                 predict_stage.predict,
                 factors.stem,
                 Parquet(str(out / factors.name)),
-                takes={"making": making, "offset": 0.0},
+                takes={"making": making, "offset": 0.0, "prediction_error": PREDICTION_ERROR},
                 reads={
                     "model": model,
                     "factors": Product(Parquet(str(factors)), "", ()),

@@ -57,13 +57,11 @@ def _plain_writer(*given: Any, write_page_checksum: bool, **how: Any) -> Any:  #
     return pq.ParquetWriter(*given, **how)
 
 
-def _plain_read(source: Any, page_checksum_verification: bool) -> Any:  # noqa: ARG001
-    return pq.read_table(source)
+def _plain_file(source: Any, page_checksum_verification: bool) -> Any:  # noqa: ARG001
+    return pq.ParquetFile(source)
 
 
-PLAIN = SimpleNamespace(
-    ParquetWriter=_plain_writer, read_table=_plain_read, read_schema=pq.read_schema
-)
+PLAIN = SimpleNamespace(ParquetWriter=_plain_writer, ParquetFile=_plain_file)
 """Parquet without checksums of pages."""
 ZERO = SimpleNamespace(crc32=lambda _: 0, value=lambda _: 0)
 """Every checksum."""

@@ -396,6 +396,14 @@ def test_a_run_that_did_not_end_is_not_whole(state: str, whole: bool, tmp_path: 
     assert (tmp_path / "run.json").exists()
 
 
+def test_brackets_within_brackets_are_damage(store: ts.TileStore) -> None:
+    key = store.keys()[0]
+    for name in (f"{key}/{POINTS}/{NODE}", NODE):
+        (Path(store.url) / name).write_text("[" * 100_000)
+        _, damages = verify(store.url)
+        assert any("nested too deep" in damage.reason for damage in damages), name
+
+
 # --- Absent is not unreadable
 
 

@@ -19,6 +19,7 @@ from pathlib import Path
 
 from tilestream.errors import LockedError, UsageError
 from tilestream.files import Files
+from tilestream.marks import parsed
 
 LOCK = ".lock"
 """Name of the lock in the folder that it is of."""
@@ -55,7 +56,7 @@ class Holder:
     def of(cls, content: bytes | None) -> "Holder | None":
         """From a lock's content; None: nobody, or nothing that we wrote."""
         try:
-            known = json.loads(content or b"")
+            known = parsed(content or b"")
             return cls(**{name: kind(known[name]) for name, kind in _FIELDS.items()})
         except (ValueError, KeyError, TypeError):
             return None

@@ -15,6 +15,19 @@ from pydantic import BaseModel
 
 from tilestream.version import VERSION
 
+
+def parsed(text: str | bytes) -> Any:
+    """The value of a JSON text that we have written.
+
+    Raises:
+        ValueError: it is none, or brackets within brackets as only damage has them.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("nested too deep") from None
+
+
 Status = Literal["missing", "damaged", "done", "failed", "skipped"]
 
 

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 
 from tilestream.errors import DamagedError, SourceNotFoundError
 from tilestream.files import Files
-from tilestream.marks import AGAIN, MISSING, Mark, sealed, unsealed
+from tilestream.marks import AGAIN, MISSING, Mark, parsed, sealed, unsealed
 from tilestream.records import Column
 
 _MARK = b"tilestream"
@@ -77,7 +77,7 @@ def read_mark(path: str) -> Mark:
     """
     try:
         text = _entry(_footer(Files.at(path)), _MARK)
-        known = {} if text is None else json.loads(text)
+        known = {} if text is None else parsed(text)
         return Mark(**unsealed(known)) if "status" in known else MISSING
     except FileNotFoundError:
         return MISSING

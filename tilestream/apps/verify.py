@@ -1,6 +1,5 @@
 """Verify a map or a run directory: read everything, name what is not as it was written."""
 
-import json
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ from typing import Any
 from tilestream.errors import DamagedError, TilestreamError, UsageError
 from tilestream.files import Files, place_of
 from tilestream.lock import only_writer
-from tilestream.marks import unsealed
+from tilestream.marks import parsed, unsealed
 from tilestream.pipeline.jobs.inventory import Entry, inventory_of
 from tilestream.pipeline.jobs.run_book import ENDED, checksum_of
 from tilestream.pipeline.jobs.run_names import INVENTORY, RECORD
@@ -188,7 +187,7 @@ def _record(folder: str) -> Findings:
     run_dir = Files.at(folder)
     record = run_dir.under(RECORD)
     try:
-        found = unsealed(json.loads(record.read()))
+        found = unsealed(parsed(record.read()))
         files: dict[str, str] = found.get("files", {})
     except (ValueError, AttributeError, OSError) as error:
         yield Damage(record.root, f"the record of the run is damaged ({error})", (), record.remove)

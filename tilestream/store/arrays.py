@@ -19,7 +19,7 @@ from zarr.storage import MemoryStore
 
 from tilestream.errors import DamagedError
 from tilestream.files import Files
-from tilestream.marks import AGAIN, MISSING, SEAL, Mark, sealed, unsealed
+from tilestream.marks import AGAIN, MISSING, SEAL, Mark, parsed, sealed, unsealed
 
 _OURS = "tilestream"
 """The attribute of a Zarr node that is ours."""
@@ -53,7 +53,7 @@ def said_by(text: bytes) -> dict[str, Any]:
         ValueError: it is no node of ours.
     """
     try:
-        return dict(json.loads(text)["attributes"][_OURS])
+        return dict(parsed(text)["attributes"][_OURS])
     except (KeyError, TypeError) as error:
         raise ValueError("no node of tilestream") from error
 
@@ -66,7 +66,7 @@ def checked(text: bytes, where: str) -> dict[str, Any]:
     """
     try:
         ours = said_by(text)
-        node = {**json.loads(text), "attributes": {}, _OURS: ours}
+        node = {**parsed(text), "attributes": {}, _OURS: ours}
         return dict(unsealed({**node, SEAL: ours.pop(SEAL, None)})[_OURS])
     except ValueError as error:
         raise DamagedError(f"{where} is damaged ({error}): {AGAIN}") from error
@@ -148,7 +148,7 @@ def erase(files: Files, table: str) -> None:
 
 def _write_node(files: Files, kept: Mapping[str, Any], ours: Mapping[str, Any]) -> None:
     """Write a node's `zarr.json`; the checksum in it is of all of it."""
-    node = {**json.loads(kept[NODE].to_bytes()), "attributes": {}}
+    node = {**parsed(kept[NODE].to_bytes()), "attributes": {}}
     seal = sealed({**node, _OURS: ours})[SEAL]
     node["attributes"] = {_OURS: {**ours, SEAL: seal}}
     files.under(NODE).write(json.dumps(node, indent=1).encode())

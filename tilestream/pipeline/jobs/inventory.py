@@ -13,7 +13,7 @@ from typing import Any
 from tilestream.errors import DamagedError, IncompleteError, UsageError
 from tilestream.files import Files, place_of
 from tilestream.lock import only_writer
-from tilestream.marks import sealed, unsealed
+from tilestream.marks import parsed, sealed, unsealed
 from tilestream.notes import some_of
 from tilestream.pipeline.engine.executor import Watch, execute
 from tilestream.pipeline.engine.outputs import Parquet, TileArrays, way_to
@@ -129,7 +129,7 @@ def inventory_of(folder: str) -> Inventory:
     """
     file = Files.at(folder).under(INVENTORY)
     try:
-        known = unsealed(json.loads(file.read()))["tables"]
+        known = unsealed(parsed(file.read()))["tables"]
     except (FileNotFoundError, NotADirectoryError):
         return {}
     except (ValueError, TypeError, KeyError) as error:

@@ -20,7 +20,7 @@ from tilestream.bounded_yaml import parse_yaml
 from tilestream.errors import DamagedError, SourceNotFoundError, UsageError
 from tilestream.files import Files
 from tilestream.grid import TileKey
-from tilestream.marks import AGAIN, hash_of, sealed, unsealed
+from tilestream.marks import AGAIN, hash_of, parsed, sealed, unsealed
 from tilestream.notes import some_of
 from tilestream.pipeline.jobs.map_update import Update
 from tilestream.pipeline.jobs.run_book import checksum_of
@@ -128,7 +128,7 @@ def told_in(folder: Files) -> Told | None:
     """
     file = folder.under(TILES)
     try:
-        return Told(**unsealed(json.loads(file.read())))
+        return Told(**unsealed(parsed(file.read())))
     except (FileNotFoundError, NotADirectoryError):
         return None
     except (ValueError, TypeError) as error:

@@ -17,7 +17,7 @@ import numpy as np
 
 from tilestream.errors import DamagedError
 from tilestream.files import Files
-from tilestream.marks import AGAIN, sealed, unsealed
+from tilestream.marks import AGAIN, parsed, sealed, unsealed
 from tilestream.pipeline.engine.attempt import Outcome
 from tilestream.pipeline.engine.executor import Watch
 from tilestream.pipeline.engine.stage import Task
@@ -132,7 +132,7 @@ class Book:
 def told_before(record: Files) -> dict[str, Any]:
     """The record of earlier calls; empty where there is none, or it is not what was written."""
     try:
-        return unsealed(json.loads(record.read()))
+        return unsealed(parsed(record.read()))
     except (OSError, ValueError, AttributeError):
         return {}
 

@@ -1,13 +1,12 @@
 """What a run directory says of itself, and what has become of the run since."""
 
-import json
 from collections.abc import Mapping
 from typing import Any
 
 from tilestream.errors import DamagedError
 from tilestream.files import Files
 from tilestream.lock import writer_of
-from tilestream.marks import unsealed
+from tilestream.marks import parsed, unsealed
 from tilestream.pipeline.jobs.run_names import RECORD
 
 CONTINUES = "the same command continues it"
@@ -22,7 +21,7 @@ def record_of(run_dir: Files) -> dict[str, Any]:
     """
     file = run_dir.under(RECORD)
     try:
-        return unsealed(json.loads(file.read()))
+        return unsealed(parsed(file.read()))
     except (FileNotFoundError, NotADirectoryError):
         return {}
     except ValueError as error:

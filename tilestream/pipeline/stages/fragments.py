@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tilestream.files import Files
 from tilestream.grid import TileKey
-from tilestream.marks import sealed, unsealed
+from tilestream.marks import parsed, sealed, unsealed
 from tilestream.pipeline.engine.outputs import Facts, Made
 from tilestream.records import Float64
 from tilestream.store import Share
@@ -101,7 +101,7 @@ class FragmentFile:
     def known(self, identity: str) -> Facts | None:
         """The index, if the fragment is whole and of this identity."""
         try:
-            known = unsealed(json.loads(self._file("json").read()))
+            known = unsealed(parsed(self._file("json").read()))
         except (FileNotFoundError, ValueError, AttributeError):  # absent or damaged: made anew
             return None
         return dict(known["index"]) if known["identity"] == identity else None
