@@ -192,7 +192,7 @@ def _record(folder: str) -> Findings:
     except (ValueError, AttributeError, OSError) as error:
         yield Damage(record.root, f"the record of the run is damaged ({error})", (), record.remove)
         return
-    ended = found.get("state") in ENDED
+    ended = found.get("state", "done") in ENDED
     yield None if ended else Damage(folder, f"the run is {state_told(run_dir, found)}")
     for name, checksum in files.items():
         file = Files.at(folder).under(name)
