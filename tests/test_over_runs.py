@@ -142,6 +142,8 @@ def test_what_must_be_equal_is_refused_by_name(runs: dict[str, Dataset]) -> None
             ts.train_over({"one": one, "other": other}, recipe="physics")
     with pytest.raises(ModelError, match="factors"):
         ts.train_over({"one": one, "other": one.with_columns(one.columns[:-1])})
+    with pytest.raises(UsageError, match="twice: its labels would count twice"):
+        ts.train_over({"one": one, "other": one}, recipe="physics")
     newer = replace(one, stages={"observe": 9})
     with pytest.raises(ModelError, match="versions of stages"):
         ts.train_over({"one": one, "other": newer})

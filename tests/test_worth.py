@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from tilestream.pipeline.jobs.run_worth import FEW_PLACES, worth_of
 from tilestream.report.formatting import cm_about, cm_limit, cm_span
-from tilestream.report.worth import BLOCKS, ELSEWHERE, HERE, NOWHERE, OWN, SIMULATION
+from tilestream.report.worth import BLOCKS, ELSEWHERE, HERE, NOWHERE, OWN, SIMULATION, Worth
 
 NO_LABELS = pd.DataFrame()
 CARD = {
@@ -167,3 +167,13 @@ def test_elsewhere_estimates_are_off_in_proportion(entry: str) -> None:
 def test_a_limit_keeps_all_digits_that_were_given() -> None:
     told = [cm_limit(x).replace("\u00a0", " ") for x in (0.001, 0.07, 0.125, 0.3, 1.1)]
     assert told == ["0.1 cm", "7 cm", "12.5 cm", "30 cm", "110 cm"]
+
+
+def test_a_few_places_tell_no_correlation() -> None:
+    few, enough = (
+        Worth("a model", HERE, places=places, drives=1, spearman=-1.0, coverage=1.0)
+        for places in (9, 10)
+    )
+    assert "too few to tell" in " ".join(few.told)
+    assert "correlation" not in " ".join(few.told)
+    assert "-1.00" in " ".join(enough.told)

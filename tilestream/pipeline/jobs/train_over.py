@@ -71,7 +71,7 @@ def dataset_over(
         raise UsageError(f"districts has {', '.join(unknown)}, and no run is named so")
     places = [of if isinstance(of, Dataset) else place_of(of) for of in runs.values()]
     for number, place in enumerate(places):
-        if any(place is other or place == other for other in places[:number]):
+        if place in places[:number]:
             raise UsageError(f"runs names {place} twice: its labels would count twice")
     return over_runs({name: _run(of, named.get(name)) for name, of in runs.items()})
 
